@@ -1,0 +1,1 @@
+"""Flax models on the evaluator's data structures."""
