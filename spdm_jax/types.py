@@ -367,3 +367,111 @@ class ScenarioInfo:
     intersection_ids: tuple[str, ...]
     track_ids: tuple[str, ...]
     notes: tuple[str, ...] = ()
+
+
+class AgentForecast(struct.PyTreeNode, kw_only=True):
+    """Selected objects of one step and where they will be, sampled every 0.2 s (S = 41).
+
+    Row order: static objects, vehicles, pedestrians, bicycles, each nearest first.
+
+    Attributes:
+      x, y, heading: `[A, S]` forecast box centre.
+      sample_valid: `[A, S]` bool, the object exists at that sample.
+      length, width: `[A]` m.
+      type: `[A]` int32, `ObjectType`.
+      is_agent: `[A]` bool, vehicle, pedestrian or bicycle.
+      speed: `[A]` current speed, m/s.
+      current_heading: `[A]` current box heading.
+      track: `[A]` int32, row in `Tracks`.
+      valid: `[A]` bool.
+      ignored: `[A]` bool, in contact with the ego now or earlier: no leader, no collision, no TTC.
+    """
+
+    x: Array
+    y: Array
+    heading: Array
+    sample_valid: Array
+    length: Array
+    width: Array
+    type: Array
+    is_agent: Array
+    speed: Array
+    current_heading: Array
+    track: Array
+    valid: Array
+    ignored: Array
+
+
+class ProposalSet(struct.PyTreeNode, kw_only=True):
+    """Ego candidates of one scenario: reference poses before tracking.
+
+    Attributes:
+      x, y, heading: `[P, T]` rear-axle poses, 0.1 s apart.
+      valid: `[P]` bool.
+      path: `[P]` int32: stage-1 paths first, then route-lane paths.
+      policy: `[P]` int32, target speed.
+      stage: `[P]` int32, 1 (IDM on the centreline and its parallels) or 2 (route lanes).
+      lane: `[P]` int32, lane that a stage-2 proposal merges onto, else -1.
+    """
+
+    x: Array
+    y: Array
+    heading: Array
+    valid: Array
+    path: Array
+    policy: Array
+    stage: Array
+    lane: Array
+
+
+class SubScores(struct.PyTreeNode, kw_only=True):
+    """The PDM score and all it is made of; padded proposals score 0.
+
+    Attributes:
+      total: `[P]` final score in [0, 1].
+      no_at_fault_collision: `[P]` 0, 0.5 or 1.
+      drivable_area: `[P]` 0 or 1.
+      driving_direction: `[P]` 0, 0.5 or 1.
+      progress: `[P]` normalised over the set.
+      time_to_collision: `[P]` 0 or 1.
+      comfort: `[P]` 0 or 1.
+      progress_raw: `[P]` m along the progress reference.
+      comfort_flags: `[P, 6]` bool: lon. acceleration, lat. acceleration, jerk, lon. jerk, yaw
+        acceleration, yaw rate.
+      collision_time: `[P]` s to the first at-fault collision, inf if none.
+      collision_object: `[P]` int32, forecast row of that object, -1 if none.
+      collision_kind: `[P]` int32, `CollisionKind` of that contact, -1 if none.
+      ttc_time: `[P]` s of the first TTC violation, inf if none.
+      ttc_object: `[P]` int32, forecast row, -1 if none.
+      multiple_lanes, non_drivable, oncoming: `[P, T]` bool ego areas.
+      valid: `[P]` bool.
+    """
+
+    total: Array
+    no_at_fault_collision: Array
+    drivable_area: Array
+    driving_direction: Array
+    progress: Array
+    time_to_collision: Array
+    comfort: Array
+    progress_raw: Array
+    comfort_flags: Array
+    collision_time: Array
+    collision_object: Array
+    collision_kind: Array
+    ttc_time: Array
+    ttc_object: Array
+    multiple_lanes: Array
+    non_drivable: Array
+    oncoming: Array
+    valid: Array
+
+
+class CollisionKind(IntEnum):
+    """How the ego and an object met (nuPlan `CollisionType`)."""
+
+    STOPPED_EGO = 0
+    STOPPED_TRACK = 1
+    ACTIVE_FRONT = 2
+    ACTIVE_REAR = 3
+    ACTIVE_LATERAL = 4

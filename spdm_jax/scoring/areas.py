@@ -1,0 +1,116 @@
+"""Which lanes the ego stands on: point-in-polygon by the grid, and the three ego-area flags."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from spdm_jax.geometry import Box, box_corners
+from spdm_jax.types import PolygonGrid
+
+
+class AreaMasks(NamedTuple):
+    """Bit sets over the grid's polygons, `[W]` uint32 each.
+
+    Attributes:
+      drivable: polygons of this step's drivable map (lanes and car parks near the ego).
+      on_route: those that belong to the route.
+      intersection: intersection areas.
+    """
+
+    drivable: jax.Array
+    on_route: jax.Array
+    intersection: jax.Array
+
+
+class EgoAreas(NamedTuple):
+    """Ego-area flags, each `[P, T]` bool (tuplan_garage `EgoAreaIndex`).
+
+    Attributes:
+      multiple_lanes: corners in several polygons and in none with all four.
+      non_drivable: some corner outside the drivable map.
+      oncoming: centre in no on-route polygon.
+    """
+
+    multiple_lanes: jax.Array
+    non_drivable: jax.Array
+    oncoming: jax.Array
+
+
+def pack_bits(flags: jax.Array, words: int) -> jax.Array:
+    """Packs `[D]` booleans into `[words]` uint32, bit d of word d // 32."""
+    padded = jnp.zeros(words * 32, bool).at[: flags.shape[0]].set(flags).reshape(words, 32)
+    return jnp.sum(padded.astype(jnp.uint32) << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
+
+
+def containing_polygons(grid: PolygonGrid, x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    """Bit sets of the polygons that contain each point.
+
+    Args:
+      grid: index over the polygons.
+      x: `[...]` point coordinates, m.
+      y: `[...]`.
+
+    Returns:
+      One uint32 array `[...]` per word of the grid's masks. Points outside the grid are in none.
+      A point exactly on an edge belongs to either side.
+    """
+    fx, fy = (x - grid.origin[0]) / grid.cell_size, (y - grid.origin[1]) / grid.cell_size
+    i, j = jnp.floor(fx).astype(jnp.int32), jnp.floor(fy).astype(jnp.int32)
+    inside = (i >= 0) & (j >= 0) & (i < grid.shape[0]) & (j < grid.shape[1])
+    cell = jnp.where(inside, i * grid.shape[1] + j, 0)
+    px = x - (grid.origin[0] + (i.astype(x.dtype) + 0.5) * grid.cell_size)
+    py = y - (grid.origin[1] + (j.astype(y.dtype) + 0.5) * grid.cell_size)
+    mask_row = grid.cell_mask[cell]
+    edge_row = jnp.where(inside, grid.cell_edges[cell], 0)
+    num_words = grid.masks.shape[1]
+    words = [jnp.where(inside, grid.masks[mask_row, w], jnp.uint32(0)) for w in range(num_words)]
+
+    def flip(slot, words):
+        ax, ay = grid.edges[edge_row, slot, 0], grid.edges[edge_row, slot, 1]
+        bx, by = grid.edges[edge_row, slot, 2], grid.edges[edge_row, slot, 3]
+        polygon = grid.edge_polygon[edge_row, slot]
+        # The segment runs from the cell centre (0, 0) to (px, py).
+        ends_apart = (px * ay - py * ax > 0) != (px * by - py * bx > 0)
+        ex, ey = bx - ax, by - ay
+        points_apart = (ey * ax - ex * ay > 0) != (ex * (py - ay) - ey * (px - ax) > 0)
+        bit = jnp.where(ends_apart & points_apart, jnp.uint32(1), jnp.uint32(0)) << (
+            polygon & 31
+        ).astype(jnp.uint32)
+        word = polygon >> 5
+        return tuple(v ^ jnp.where(word == w, bit, jnp.uint32(0)) for w, v in enumerate(words))
+
+    return jax.lax.fori_loop(0, grid.edges.shape[1], flip, tuple(words))
+
+
+def ego_areas(grid: PolygonGrid, masks: AreaMasks, box: Box) -> EgoAreas:
+    """Classifies ego boxes `[P, T]`.
+
+    Source: tuplan_garage `PDMScorer._calculate_ego_areas`. With c_j corners in polygon j: multiple
+    lanes = more than one j with c_j > 0 and none with c_j = 4; non-drivable = a corner in no
+    polygon; oncoming = centre in no on-route polygon (so off-road counts as oncoming too).
+    """
+    cx, cy = box_corners(box)
+    x = jnp.concatenate([cx, box.x[..., None]], -1)
+    y = jnp.concatenate([cy, box.y[..., None]], -1)
+    touched = jnp.zeros(box.x.shape, jnp.int32)
+    whole = jnp.zeros(box.x.shape, bool)
+    on_route = jnp.zeros(box.x.shape, bool)
+    corner_inside = jnp.zeros(cx.shape, bool)
+    for w, word in enumerate(containing_polygons(grid, x, y)):
+        word = word & masks.drivable[w]
+        corners = [word[..., c] for c in range(4)]
+        touched += jax.lax.population_count(
+            corners[0] | corners[1] | corners[2] | corners[3]
+        ).astype(jnp.int32)
+        whole |= (corners[0] & corners[1] & corners[2] & corners[3]) != 0
+        corner_inside |= word[..., :4] != 0
+        on_route |= (word[..., 4] & masks.on_route[w]) != 0
+    return EgoAreas((touched > 1) & ~whole, ~jnp.all(corner_inside, -1), ~on_route)
+
+
+def in_intersection(grid: PolygonGrid, masks: AreaMasks, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Whether points lie in an intersection area, `[...]` bool."""
+    words = containing_polygons(grid, x, y)
+    hits = [(word & masks.intersection[w]) != 0 for w, word in enumerate(words)]
+    return jnp.any(jnp.stack(hits), axis=0)

@@ -1,0 +1,96 @@
+"""Comfort: Savitzky-Golay filters as constant matrices, six strict bounds."""
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from spdm_jax.config import DT, ScoringParams
+from spdm_jax.geometry import unwrap_masked
+from spdm_jax.types import EgoState
+
+
+@lru_cache(maxsize=16)
+def savgol_matrix(size: int, window: int, order: int, derivative: int) -> np.ndarray:
+    """Returns the `[T, T]` float64 matrix of a Savitzky-Golay filter with "interp" edges.
+
+    An even window is fitted to samples i - w/2 + 1 ... i + w/2 and evaluated half a sample late,
+    as scipy does; the edges are the polynomial of the first and last full window.
+    """
+    window = min(window, size)
+    matrix = np.zeros((size, size))
+
+    def weights(at: float) -> np.ndarray:
+        powers = np.arange(order + 1)
+        q, r = np.linalg.qr((np.arange(window) - (window - 1) / 2)[:, None] ** powers)
+        fit = np.linalg.solve(r, q.T)
+        factor = np.array(
+            [np.prod(np.arange(p - derivative + 1, p + 1)) if p >= derivative else 0 for p in powers]
+        )
+        value = factor * np.where(powers >= derivative, at ** np.maximum(powers - derivative, 0), 0)
+        return value @ fit / DT**derivative
+
+    half, middle = window // 2, (window - 1) / 2
+    for i in range(size):
+        if i < half:
+            first, at = 0, i - middle
+        elif i >= size - half:
+            first, at = size - window, i - (size - window) - middle
+        else:
+            first, at = i - (window - 1) // 2, 0.0
+        matrix[i, first : first + window] = weights(at)
+    return matrix
+
+
+def _apply(matrix: np.ndarray, signal: jax.Array) -> jax.Array:
+    operator = jnp.asarray(matrix, signal.dtype)
+    return _rounded(jnp.matmul(signal, operator.T, precision=jax.lax.Precision.HIGHEST))
+
+
+def _rounded(signal: jax.Array) -> jax.Array:
+    # nuPlan rounds to 8 decimals, which float32 cannot hold.
+    return jnp.round(signal, 8) if signal.dtype == jnp.float64 else signal
+
+
+def comfort_signals(ego: EgoState) -> dict[str, jax.Array]:
+    """Filtered signals `[P, T]`, in the order of nuPlan's six comfort metrics.
+
+    Source: tuplan_garage `pdm_comfort_metrics`. Its yaw filters keep a window of 5 (the long window
+    is not passed on), its acceleration filters take the whole horizon.
+    """
+    size = ego.ax.shape[-1]
+    magnitude = jnp.hypot(ego.ax, ego.ay)
+    smooth = savgol_matrix(size, 8, 2, 0)
+    jerk = savgol_matrix(size, size, 2, 1)
+    heading = unwrap_masked(ego.heading, jnp.ones(ego.heading.shape, bool))
+    # Yaw derivatives do not see a constant; without it float32 keeps its digits.
+    heading = heading - heading[..., :1]
+    return {
+        "lon_accel": _apply(savgol_matrix(size, size, 2, 0), ego.ax),
+        "lat_accel": _apply(savgol_matrix(size, size, 2, 0), ego.ay),
+        "jerk": _apply(jerk, _apply(smooth, magnitude)),
+        "lon_jerk": _apply(jerk, _apply(smooth, ego.ax)),
+        "yaw_accel": _apply(savgol_matrix(size, 5, 3, 2), heading),
+        "yaw_rate": _apply(savgol_matrix(size, 5, 2, 1), heading),
+    }
+
+
+def comfort_flags(ego: EgoState, params: ScoringParams) -> jax.Array:
+    """Whether each of the six signals stays strictly inside its bounds, `[P, 6]` bool."""
+    bounds = {
+        "lon_accel": (params.lon_accel_min, params.lon_accel_max),
+        "lat_accel": (-params.lat_accel_max, params.lat_accel_max),
+        "jerk": (-params.jerk_max, params.jerk_max),
+        "lon_jerk": (-params.lon_jerk_max, params.lon_jerk_max),
+        "yaw_accel": (-params.yaw_accel_max, params.yaw_accel_max),
+        "yaw_rate": (-params.yaw_rate_max, params.yaw_rate_max),
+    }
+    signals = comfort_signals(ego)
+    return jnp.stack(
+        [
+            jnp.all((signal > bounds[name][0]) & (signal < bounds[name][1]), axis=-1)
+            for name, signal in signals.items()
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,44 @@
+"""Driving direction and progress."""
+
+import jax
+import jax.numpy as jnp
+
+from spdm_jax.config import ScoringParams
+from spdm_jax.geometry import Path, project
+
+
+def driving_direction(
+    center_x: jax.Array, center_y: jax.Array, oncoming: jax.Array, params: ScoringParams
+) -> jax.Array:
+    """Returns 1, 0.5 or 0 by the longest run of driving against traffic, `[P]`.
+
+    Args:
+      center_x: `[P, T]` ego centre, m.
+      center_y: `[P, T]`.
+      oncoming: `[P, T]` bool, the centre is in no on-route polygon.
+      params: thresholds.
+
+    Source: tuplan_garage `PDMScorer._calculate_driving_direction_compliance`: the distance driven
+    in each uninterrupted run of oncoming states, its maximum against 2 m and 6 m.
+    """
+    step = jnp.hypot(jnp.diff(center_x, axis=-1), jnp.diff(center_y, axis=-1))
+    step = jnp.concatenate([jnp.zeros_like(step[..., :1]), step], axis=-1)
+    total = jnp.cumsum(jnp.where(oncoming, step, 0), axis=-1)
+    before = jax.lax.cummax(jnp.where(oncoming, 0, total), axis=total.ndim - 1)
+    longest = jnp.max(total - before, axis=-1)
+    score = jnp.where(
+        longest < params.driving_direction_compliant,
+        1.0,
+        jnp.where(longest < params.driving_direction_violation, 0.5, 0.0),
+    )
+    return score.astype(center_x.dtype)
+
+
+def progress(path: Path, center_x: jax.Array, center_y: jax.Array) -> jax.Array:
+    """Metres along the path between the first and the last ego centre, not negative, `[P]`.
+
+    Source: tuplan_garage `PDMScorer._calculate_progress`.
+    """
+    start = project(path, center_x[..., 0], center_y[..., 0])
+    end = project(path, center_x[..., -1], center_y[..., -1])
+    return jnp.maximum(end - start, 0)

@@ -1,0 +1,1 @@
+"""Parity harness: every stage against stored outputs of the reference implementations."""
