@@ -60,9 +60,7 @@ class Report:
         if mask is not None:
             difference = difference[np.broadcast_to(mask, difference.shape)]
         worst = float(difference.max()) if difference.size else 0.0
-        self.rows.append(
-            Row(file, array, worst, 0, int(difference.size), tolerance, note)
-        )
+        self.rows.append(Row(file, array, worst, 0, int(difference.size), tolerance, note))
 
     def equal(self, file, array, ours, reference, mask=None, note=""):
         """Records how many entries differ."""
@@ -97,7 +95,9 @@ class Report:
 
     def table(self) -> str:
         """One line per file and array."""
-        lines = [f"{'file':<44} {'array':<34} {'deviation':>11} {'differ':>7} {'compared':>9}  note"]
+        lines = [
+            f"{'file':<44} {'array':<34} {'deviation':>11} {'differ':>7} {'compared':>9}  note"
+        ]
         for row in self.rows:
             deviation = f"{row.deviation:.2e}" if row.tolerance is not None else "-"
             differ = "-" if row.tolerance is not None else str(row.mismatches)
