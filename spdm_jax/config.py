@@ -157,8 +157,13 @@ class PlannerConfig:
         matrix of the velocity fit.
       forecast: where the agents' future comes from.
       progress_reference: "auto" is the centreline for K = 0 and the goal path otherwise.
-      max_vehicles, max_pedestrians, max_bicycles, max_static: nearest objects kept per step.
-      borrow_oncoming: reserved extension (off, as in the paper).
+      max_vehicles: nearest vehicles kept per step; likewise the three fields that follow.
+      max_pedestrians: see above.
+      max_bicycles: see above.
+      max_static: see above.
+      max_path_points: room for the points of a path; too little is reported as overflow.
+      max_red_lights: room for red connectors on the route.
+      max_red_edges: room for their edges.
     """
 
     num_route_paths: int = 0
@@ -169,6 +174,9 @@ class PlannerConfig:
     max_pedestrians: int = 25
     max_bicycles: int = 10
     max_static: int = 50
+    max_path_points: int = 1024
+    max_red_lights: int = 16
+    max_red_edges: int = 2048
 
     def __post_init__(self):
         if self.num_route_paths < 0:

@@ -73,11 +73,12 @@ def boxes_overlap(a: Box, b: Box) -> jax.Array:
     dx, dy = b.x - a.x, b.y - a.y
     cos = jnp.abs(a.cos * b.cos + a.sin * b.sin)
     sin = jnp.abs(a.cos * b.sin - a.sin * b.cos)
+    al, aw, bl, bw = a.half_length, a.half_width, b.half_length, b.half_width
     return (
-        (jnp.abs(dx * a.cos + dy * a.sin) <= a.half_length + b.half_length * cos + b.half_width * sin)
-        & (jnp.abs(dy * a.cos - dx * a.sin) <= a.half_width + b.half_length * sin + b.half_width * cos)
-        & (jnp.abs(dx * b.cos + dy * b.sin) <= b.half_length + a.half_length * cos + a.half_width * sin)
-        & (jnp.abs(dy * b.cos - dx * b.sin) <= b.half_width + a.half_length * sin + a.half_width * cos)
+        (jnp.abs(dx * a.cos + dy * a.sin) <= al + bl * cos + bw * sin)
+        & (jnp.abs(dy * a.cos - dx * a.sin) <= aw + bl * sin + bw * cos)
+        & (jnp.abs(dx * b.cos + dy * b.sin) <= bl + al * cos + aw * sin)
+        & (jnp.abs(dy * b.cos - dx * b.sin) <= bw + al * sin + aw * cos)
     )
 
 
@@ -145,9 +146,7 @@ def segment_box_distance(ax, ay, bx, by, box: Box) -> jax.Array:
         square = ux * ux + uy * uy
         best = square if best is None else jnp.minimum(best, square)
     for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
-        square, _ = point_segment_sq(
-            i * box.half_length, j * box.half_width, ax_, ay_, bx_, by_
-        )
+        square, _ = point_segment_sq(i * box.half_length, j * box.half_width, ax_, ay_, bx_, by_)
         best = jnp.minimum(best, square)
     return jnp.where(segment_meets_box(ax, ay, bx, by, box), 0, jnp.sqrt(best))
 

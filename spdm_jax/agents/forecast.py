@@ -47,9 +47,7 @@ def constant_velocity(observation: Observation, selected: SelectedObjects) -> Fo
     )
 
 
-def perfect(
-    observation: Observation, selected: SelectedObjects, tracks: Tracks
-) -> ForecastPoses:
+def perfect(observation: Observation, selected: SelectedObjects, tracks: Tracks) -> ForecastPoses:
     """Reads the agents' recorded future; an agent that leaves the record is gone from there on.
 
     The current sample is the observation itself, and static objects stay where they are.

@@ -163,12 +163,12 @@ def red_lights(
     )
 
 
-def edge_centroids(
-    edges: jax.Array, slot: jax.Array, valid: jax.Array, num: int
-) -> jax.Array:
+def edge_centroids(edges: jax.Array, slot: jax.Array, valid: jax.Array, num: int) -> jax.Array:
     """Area centroids `[num, 2]` of polygons given as edges (shoelace about a point of each)."""
-    pivot = jnp.zeros((num, 2), edges.dtype).at[slot].set(
-        jnp.where(valid[:, None], edges[:, :2], 0), mode="drop"
+    pivot = (
+        jnp.zeros((num, 2), edges.dtype)
+        .at[slot]
+        .set(jnp.where(valid[:, None], edges[:, :2], 0), mode="drop")
     )
     here = pivot[jnp.clip(slot, 0, num - 1)]
     a, b = edges[:, :2] - here, edges[:, 2:] - here

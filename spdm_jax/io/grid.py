@@ -99,9 +99,9 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
     for bit, polygon in enumerate(polygons):
         if shapely.is_empty(polygon):
             continue
-        x0, y0, x1, y1 = shapely.bounds(polygon)
-        i0, i1 = np.clip(((np.array([x0, x1]) - origin[0]) / size).astype(int) + (-1, 2), 0, nx)
-        j0, j1 = np.clip(((np.array([y0, y1]) - origin[1]) / size).astype(int) + (-1, 2), 0, ny)
+        bounds = (np.array(shapely.bounds(polygon)) - np.tile(origin, 2)) / size
+        i0, j0 = np.maximum(bounds[:2].astype(int) - 1, 0)
+        i1, j1 = np.minimum(bounds[2:].astype(int) + 2, shape)
         inside = _inside(
             origin[0] + (np.arange(i0, i1) + 0.5) * size,
             origin[1] + (np.arange(j0, j1) + 0.5) * size,

@@ -178,13 +178,13 @@ def corridor_hits_lights(axis: Corridor, half_width: jax.Array, red: RedLights) 
     ax, ay, bx, by = red.edges.T
 
     def visit(i, hit):
-        return hit | segment_meets_box(ax, ay, bx, by, jax.tree.map(lambda v: v[i], pieces.box)) & (
-            pieces.used[i]
+        return (
+            hit
+            | segment_meets_box(ax, ay, bx, by, jax.tree.map(lambda v: v[i], pieces.box))
+            & (pieces.used[i])
         )
 
-    edge = jax.lax.fori_loop(
-        0, jnp.maximum(axis.count - 1, 1), visit, jnp.zeros(ax.shape, bool)
-    )
+    edge = jax.lax.fori_loop(0, jnp.maximum(axis.count - 1, 1), visit, jnp.zeros(ax.shape, bool))
     inside = crosses_upward_ray(axis.x[0], axis.y[0], ax, ay, bx, by)
     num = red.valid.shape[0]
     edge = (edge & red.edge_valid).astype(jnp.int32)

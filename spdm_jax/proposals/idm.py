@@ -164,9 +164,7 @@ def _search(forecast: AgentForecast, red: RedLights, contents: CorridorContents)
         heading=forecast.current_heading,
         speed=jnp.where(forecast.is_agent, forecast.speed, 0),
         contents=contents,
-        eligible=jnp.concatenate(
-            [forecast.valid & ~forecast.ignored, red.valid & ~red.ignored]
-        ),
+        eligible=jnp.concatenate([forecast.valid & ~forecast.ignored, red.valid & ~red.ignored]),
         red=red,
         any_red=jnp.any(red.valid & ~red.ignored),
     )
@@ -234,7 +232,9 @@ def _find_leader(
     distance = jnp.where(candidate, jnp.concatenate([distance, lights]), jnp.inf)
     least = jnp.min(distance)
     found = least < jnp.inf
-    order = jnp.where(distance <= least, rank, jnp.iinfo(jnp.int32).max)
+    # Objects side by side are equally far up to rounding: the given order decides, not the noise.
+    tie = 1e-6 if x.dtype == jnp.float64 else 2e-5
+    order = jnp.where(distance <= least + tie, rank, jnp.iinfo(jnp.int32).max)
     index = jnp.argmin(order)
     num_objects = search.heading.shape[0]
     is_light = found & (index >= num_objects)

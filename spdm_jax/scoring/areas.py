@@ -40,7 +40,9 @@ class EgoAreas(NamedTuple):
 def pack_bits(flags: jax.Array, words: int) -> jax.Array:
     """Packs `[D]` booleans into `[words]` uint32, bit d of word d // 32."""
     padded = jnp.zeros(words * 32, bool).at[: flags.shape[0]].set(flags).reshape(words, 32)
-    return jnp.sum(padded.astype(jnp.uint32) << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
+    return jnp.sum(
+        padded.astype(jnp.uint32) << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32
+    )
 
 
 def containing_polygons(grid: PolygonGrid, x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:

@@ -100,9 +100,7 @@ def first_contacts(
             hit = hits(f, every, target, alive[:, f, :, None])  # [A, T, P]
             if f == 0:
                 first = jnp.min(jnp.where(hit, index, jnp.int32(steps)), axis=1)
-            this = jnp.min(
-                jnp.where(hit & moving, index * _NUM_AHEAD + f, never), axis=1
-            )
+            this = jnp.min(jnp.where(hit & moving, index * _NUM_AHEAD + f, never), axis=1)
             key = this if key is None else jnp.minimum(key, this)
         assert first is not None and key is not None
         return Contacts(first.T, key.T)

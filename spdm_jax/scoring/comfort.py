@@ -26,7 +26,10 @@ def savgol_matrix(size: int, window: int, order: int, derivative: int) -> np.nda
         q, r = np.linalg.qr((np.arange(window) - (window - 1) / 2)[:, None] ** powers)
         fit = np.linalg.solve(r, q.T)
         factor = np.array(
-            [np.prod(np.arange(p - derivative + 1, p + 1)) if p >= derivative else 0 for p in powers]
+            [
+                np.prod(np.arange(p - derivative + 1, p + 1)) if p >= derivative else 0
+                for p in powers
+            ]
         )
         value = factor * np.where(powers >= derivative, at ** np.maximum(powers - derivative, 0), 0)
         return value @ fit / DT**derivative

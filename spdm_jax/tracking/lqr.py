@@ -121,9 +121,7 @@ def bicycle_step(
     rate = (state.steering + lag * (ideal - state.steering) - state.steering) / DT
     turn = DT * state.vx * jnp.tan(state.steering) / vehicle.wheel_base
     speed = state.vx + DT * accel
-    steering = jnp.clip(
-        state.steering + DT * rate, -params.max_steering, params.max_steering
-    )
+    steering = jnp.clip(state.steering + DT * rate, -params.max_steering, params.max_steering)
     yaw_rate = speed * jnp.tan(steering) / vehicle.wheel_base
     zero = jnp.zeros_like(speed)
     return EgoState(
@@ -179,9 +177,7 @@ def track(
     speed, curvature = reference_profiles(x, y, heading, tracker)
     steps = speed.shape[-1]
     windows = jnp.asarray(_window_matrix(steps), x.dtype)
-    moments = jnp.einsum(
-        "mkj,pj->mkp", windows, curvature, precision=jax.lax.Precision.HIGHEST
-    )
+    moments = jnp.einsum("mkj,pj->mkp", windows, curvature, precision=jax.lax.Precision.HIGHEST)
     target = np.minimum(np.arange(steps) + HORIZON, steps - 1)
     reference = {
         "x": x[:, :-1].T,
@@ -200,7 +196,5 @@ def track(
         return following, (following, jnp.stack([accel, rate], -1))
 
     _, (states, commands) = jax.lax.scan(step, start, reference)
-    states = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]).T, start, states
-    )
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]).T, start, states)
     return states, jnp.moveaxis(commands, 0, 1)

@@ -43,9 +43,7 @@ def speed_fit_matrix(num_steps: int, tracker: Tracker) -> np.ndarray:
     return to_speed @ np.linalg.solve(normal, rows.T)
 
 
-def speed_profile(
-    x: jax.Array, y: jax.Array, heading: jax.Array, tracker: Tracker
-) -> jax.Array:
+def speed_profile(x: jax.Array, y: jax.Array, heading: jax.Array, tracker: Tracker) -> jax.Array:
     """Fits speeds `[P, N]` (m/s) to poses `[P, N + 1]`."""
     dx, dy = jnp.diff(x, axis=-1), jnp.diff(y, axis=-1)
     start = heading[..., :-1]
@@ -59,7 +57,7 @@ def curvature_profile(heading: jax.Array, speed: jax.Array) -> jax.Array:
 
     Minimises sum (dh_i - dt v_i k_i)^2 + lam / dt^2 sum (k_{i+1} - k_i)^2 + 1e-10 k_0^2. The
     tridiagonal solve is written in information form (p = pivot minus the coupling), where every
-    term is non-negative: standing still, where the plain pivot cancels to zero in float32, is exact.
+    term is non-negative: at standstill the plain pivot would cancel to zero in float32.
 
     Source: tuplan_garage `batch_lqr_utils._fit_initial_curvature_and_curvature_rate_profile`.
     """

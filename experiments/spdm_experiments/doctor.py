@@ -1,0 +1,126 @@
+"""`spdm doctor`: what is installed, and does this machine compute what it should.
+
+A linear-algebra kernel that is silently wrong on one host shows up as scores of zero, hours later.
+The checks solve problems whose answers are known beforehand and take a few seconds.
+"""
+
+import importlib.metadata
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+PACKAGES = (
+    "spdm-jax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "numpy",
+    "shapely",
+    "polars",
+    "pyproj",
+    "pyyaml",
+    "matplotlib",
+)
+
+
+@dataclass(frozen=True)
+class Check:
+    """Result of one self-test: `deviation` from the known answer, and what is tolerated."""
+
+    name: str
+    deviation: float
+    tolerance: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the deviation is within the tolerance; NaN is not."""
+        return self.deviation <= self.tolerance
+
+
+def report(cache: Path | None) -> tuple[list[str], bool]:
+    """Returns the lines to print and whether every check passed."""
+    lines = [f"python      {platform.python_version()} on {platform.platform()}"]
+    lines += [f"{name:11} {version(name)}" for name in PACKAGES]
+    lines += [f"device      {device.device_kind} ({device.platform})" for device in jax.devices()]
+    lines.append(f"cache       {cache or 'off'}")
+    checks = run_checks()
+    lines += [
+        f"{'ok    ' if check.passed else 'FAILED'}      {check.name}: deviation "
+        f"{check.deviation:.1e}, tolerance {check.tolerance:.0e}"
+        for check in checks
+    ]
+    return lines, all(check.passed for check in checks)
+
+
+def version(name: str) -> str:
+    """Returns the installed version of a distribution, or that it is missing."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return 'not installed (pip install "spdm-jax[data,plot]")'
+
+
+def run_checks() -> list[Check]:
+    """Runs every self-test in float32 and, where 64-bit types are enabled, in float64."""
+    precisions = [np.float32, *([np.float64] if jax.config.values["jax_enable_x64"] else [])]
+    checks: list[Check] = []
+    for dtype in precisions:
+        # Room for another summation order and other sine kernels, not for a wrong result.
+        unit = float(np.finfo(dtype).eps)
+        tests: tuple[tuple[str, Callable[[type], float], float], ...] = (
+            ("least squares", _least_squares, 2e3 * unit),
+            ("angles", _angles, 20 * unit),
+            ("batched = one by one", _batching, 200 * unit),
+        )
+        checks += [
+            Check(f"{name} ({np.dtype(dtype).name})", test(dtype), tolerance)
+            for name, test, tolerance in tests
+        ]
+    return checks
+
+
+def _velocity_fit(positions: jax.Array) -> jax.Array:
+    """Returns the smooth velocity whose integral follows `positions` `[T]` (jerk penalised)."""
+    count = positions.shape[0] - 1
+    dt, weight = 0.1, 1e-4
+    integral = dt * np.tril(np.ones((count, count)))
+    second = np.diff(np.eye(count), n=2, axis=0) / dt**2
+    matrix = jnp.asarray(np.vstack([integral, np.sqrt(weight) * second]), positions.dtype)
+    target = jnp.concatenate([positions[1:] - positions[0], jnp.zeros(count - 2, positions.dtype)])
+    with jax.default_matmul_precision("highest"):
+        q, r = jnp.linalg.qr(matrix)
+        return jax.scipy.linalg.solve_triangular(r, q.T @ target)
+
+
+def _least_squares(dtype: type) -> float:
+    # Velocity that grows linearly has no second difference: the fit must give it back.
+    velocity = 8.0 + 0.05 * np.arange(40)
+    positions = np.concatenate([[0.0], np.cumsum(0.1 * velocity)]).astype(dtype)
+    found = jax.jit(_velocity_fit)(positions)
+    return float(np.max(np.abs(np.asarray(found, np.float64) - velocity)))
+
+
+def _angles(dtype: type) -> float:
+    angles = np.linspace(-3.1, 3.1, 2001).astype(dtype)
+    back = jax.jit(lambda x: jnp.arctan2(jnp.sin(x), jnp.cos(x)))(angles)
+    exact = np.stack([np.sin(angles.astype(np.float64)), np.cos(angles.astype(np.float64))])
+    direct = jax.jit(lambda x: jnp.stack([jnp.sin(x), jnp.cos(x)]))(angles)
+    return float(
+        max(
+            np.max(np.abs(np.asarray(back, np.float64) - angles.astype(np.float64))),
+            np.max(np.abs(np.asarray(direct, np.float64) - exact)),
+        )
+    )
+
+
+def _batching(dtype: type) -> float:
+    rows = np.random.default_rng(0).uniform(0, 1, (16, 41)).cumsum(axis=1).astype(dtype)
+    single = jax.jit(_velocity_fit)
+    together = np.asarray(jax.jit(jax.vmap(_velocity_fit))(rows))
+    alone = np.stack([np.asarray(single(row)) for row in rows])
+    return float(np.max(np.abs(together - alone)) / np.max(np.abs(alone)))
