@@ -10,6 +10,7 @@ from shapely.geometry.base import BaseGeometry
 
 from spdm_jax.io.raw import RawArea, RawMap, RawScenario, RawTracks, ScenarioError
 from spdm_jax.synthetic import junctions, scenes
+from spdm_jax.synthetic.roundabout import roundabout
 from spdm_jax.synthetic.stage import Stage
 from spdm_jax.synthetic.traffic import NUM_HISTORY, NUM_ITERATIONS, NUM_STEPS, simulate
 
@@ -33,6 +34,7 @@ SCENES: dict[str, Callable[..., Stage]] = {
         junctions.intersection,
         junctions.red_light,
         junctions.tight_turn,
+        roundabout,
     )
 }
 """Scene functions by name; their keyword arguments are the options of `make_scene`."""

@@ -45,11 +45,12 @@ def intersection(
     """
     turn = turn or str(rng.choice(list(TURNS)))
     builder, arms = _crossing(rng, lanes=2, radius=17.0, speed_limit=speed_limit, light=False)
-    stage = _approach(builder, turn, distance, speed, speed_limit, {}, lanes=2)
+    connector = f"south>{target_arm(turn)}/{0 if turn == 'left' else 1}"
+    stage = approach(builder, [connector], distance, speed, speed_limit)
     line = stage.ego.station + EGO_FRONT + distance - 1.0
     stage.ego = dataclasses.replace(stage.ego, give_way=line)
     _cross_traffic(rng, stage, 2, spacing, speed, speed_limit)
-    _pavement_walks(rng, stage, arms, 2)
+    pavement_walks(rng, stage, arms, 2)
     return stage
 
 
@@ -91,7 +92,7 @@ def red_light(
         for lane in builder.lanes.values()
         if lane.has_traffic_light
     }
-    stage = _approach(builder, "straight", distance, speed, speed_limit, lights, lanes=2)
+    stage = approach(builder, ["south>north/1"], distance, speed, speed_limit, lights)
     front = stage.ego.station + EGO_FRONT + distance
     for i in range(count):
         station = front - 4.5 - 7.5 * i
@@ -99,7 +100,7 @@ def red_light(
             vehicle(rng, stage.ego.path, station, 0.0, speed_limit, stage.ego.gates)
         )
     _cross_traffic(rng, stage, 2, 30.0, speed, speed_limit)
-    _pavement_walks(rng, stage, arms, 2)
+    pavement_walks(rng, stage, arms, 2)
     return stage
 
 
@@ -120,8 +121,9 @@ def tight_turn(
       ValueError: an unknown turn, or a distance outside 2 ... 150 m.
     """
     builder, arms = _crossing(rng, lanes=1, radius=10.5, speed_limit=speed_limit, light=False)
-    stage = _approach(builder, turn, distance, speed, speed_limit, {}, lanes=1)
-    area = next(a for a in builder.crosswalks if a.id == f"{TURNS[turn]}.crosswalk").polygon
+    target = target_arm(turn)
+    stage = approach(builder, [f"south>{target}/0"], distance, speed, speed_limit)
+    area = next(a for a in builder.crosswalks if a.id == f"{target}.crosswalk").polygon
     corners = shapely.get_coordinates(area)
     # Corner order of a strip: left begin ... left end, right end ... right begin, and closed.
     half = (len(corners) - 1) // 2
@@ -131,7 +133,7 @@ def tight_turn(
     if rng.random() < 0.5:
         ends = ends[::-1]
     stage.scripted.append(walk(ends[0], ends[1], rng.uniform(1.0, 1.5), rng.uniform(0.0, 4.0)))
-    _pavement_walks(rng, stage, arms, 1)
+    pavement_walks(rng, stage, arms, 1)
     return stage
 
 
@@ -140,6 +142,24 @@ def _crossing(
 ) -> tuple[MapBuilder, dict[str, Path]]:
     """Returns four arms of two blocks each around a crossing at the origin, and their paths."""
     builder = MapBuilder("synthetic")
+    arms = add_arms(rng, builder, lanes=lanes, radius=radius, speed_limit=speed_limit)
+    add_crossing(builder, "crossing", arms, lanes=lanes, num_blocks=2, light=light)
+    return builder, arms
+
+
+def add_arms(
+    rng: np.random.Generator,
+    builder: MapBuilder,
+    *,
+    lanes: int,
+    radius: float,
+    speed_limit: float,
+) -> dict[str, Path]:
+    """Adds four arms of two blocks each that begin `radius` m from the origin.
+
+    Returns:
+      Their outward paths by name, counter-clockwise.
+    """
     arms: dict[str, Path] = {}
     for i, arm in enumerate(ARMS):
         angle = i * np.pi / 2 + rng.uniform(-0.08, 0.08)
@@ -156,33 +176,51 @@ def _crossing(
             speed_limit=speed_limit,
             connector_limit=speed_limit,
         )
-    add_crossing(builder, "crossing", arms, lanes=lanes, num_blocks=2, light=light)
-    return builder, arms
+    return arms
 
 
-def _approach(
+def target_arm(turn: str) -> str:
+    """Returns the arm that a turn of the ego leads to.
+
+    Raises:
+      ValueError: an unknown turn.
+    """
+    if turn not in TURNS:
+        raise ValueError(f"turn is {turn!r}; it must be one of {sorted(TURNS)}")
+    return TURNS[turn]
+
+
+def approach(
     builder: MapBuilder,
-    turn: str,
+    connectors: list[str],
     distance: float,
     speed: float,
     speed_limit: float,
-    lights: dict[str, np.ndarray],
-    lanes: int,
+    lights: dict[str, np.ndarray] | None = None,
 ) -> Stage:
-    """Returns a stage with the ego on the southern arm, heading for the crossing."""
-    if turn not in TURNS:
-        raise ValueError(f"turn is {turn!r}; it must be one of {sorted(TURNS)}")
+    """Returns a stage with the ego on the southern arm.
+
+    Args:
+      builder: the map.
+      connectors: the ego's connectors where lanes fork, the first leads out of the arm.
+      distance: from the ego's front bumper to that connector, m.
+      speed: at iteration 0, m/s.
+      speed_limit: which the ego would like to drive, m/s.
+      lights: see `Stage`.
+
+    Raises:
+      ValueError: the distance is outside 2 ... 150 m.
+    """
     if not 2.0 <= distance <= 150.0:
         raise ValueError(f"distance is {distance} m; it must be within 2 ... 150 m")
-    number = 0 if turn == "left" else lanes - 1
-    connector = f"south>{TURNS[turn]}/{number}"
-    whole = builder.follow(f"south~:0/{number}", [connector])
+    number = builder.lanes[connectors[0]].predecessors[0].rpartition("/")[2]
+    whole = builder.follow(f"south~:0/{number}", connectors)
     path = builder.path(whole)
-    end = path.station_of(builder.lanes[connector].centerline[0, :2])
-    station = end - distance - EGO_FRONT
-    # The route starts in the ego's own block.
     starts = [path.station_of(builder.lanes[i].centerline[0, :2]) for i in whole]
+    station = starts[whole.index(connectors[0])] - distance - EGO_FRONT
+    # The route starts in the ego's own block.
     first = int(np.searchsorted(starts, station, side="right")) - 1
+    lights = lights or {}
     gates = gates_of(builder, path, whole, lights)
     ego = Follower(path, station, speed, speed_limit, gates=gates)
     return Stage(builder, whole[first:], ego, lights=lights)
@@ -219,10 +257,12 @@ def _cross_traffic(
             )
     ego = stage.ego
     behind = ego.station - rng.uniform(18.0, 30.0)
-    stage.followers.append(vehicle(rng, ego.path, behind, ego.speed, speed_limit, ego.gates))
+    stage.followers.append(
+        vehicle(rng, ego.path, behind, ego.speed, speed_limit, ego.gates, ego.give_way)
+    )
 
 
-def _pavement_walks(
+def pavement_walks(
     rng: np.random.Generator, stage: Stage, arms: dict[str, Path], lanes: int
 ) -> None:
     """Adds pavements beside the arms and a pedestrian on each arm's."""

@@ -113,8 +113,8 @@ def parked_car(
     if left_lane_free:
         # Out before the car, back behind it; where the gap is too short for that, stop.
         out, back = rear - 1.0, rear + size[0] + 6.0
-        if out - EGO_STATION >= 12.0:
-            around = own.shifted(EGO_STATION, out, LANE_WIDTH)
+        if out - EGO_STATION >= 14.0:
+            around = own.shifted(EGO_STATION + 2.0, out, LANE_WIDTH)
             around = around.shifted(back, back + 30.0, -LANE_WIDTH)
             stage.ego = Follower(around, EGO_STATION, speed, speed_limit)
         end = EGO_STATION - 45.0

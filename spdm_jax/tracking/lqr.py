@@ -147,6 +147,26 @@ def reference_profiles(
     return speed, curvature_profile(heading, speed)
 
 
+def reference_at(
+    x: jax.Array, y: jax.Array, heading: jax.Array, tracker: Tracker
+) -> dict[str, jax.Array]:
+    """What the controller reads at each step, time first: `[T - 1, P]`, moments `[T - 1, 5, P]`."""
+    speed, curvature = reference_profiles(x, y, heading, tracker)
+    steps = speed.shape[-1]
+    windows = jnp.asarray(_window_matrix(steps), x.dtype)
+    moments = jnp.einsum("mkj,pj->kmp", windows, curvature, precision=jax.lax.Precision.HIGHEST)
+    target = np.minimum(np.arange(steps) + HORIZON, steps - 1)
+    return {
+        "x": x[:, :-1].T,
+        "y": y[:, :-1].T,
+        "heading": heading[:, :-1].T,
+        "cos": jnp.cos(heading[:, :-1]).T,
+        "sin": jnp.sin(heading[:, :-1]).T,
+        "speed": speed[:, target].T,
+        "moments": moments,
+    }
+
+
 def track(
     x: jax.Array,
     y: jax.Array,
@@ -174,20 +194,7 @@ def track(
     Source: tuplan_garage `PDMSimulator`, `BatchLQRTracker`, `BatchKinematicBicycleModel`.
     """
     num = x.shape[0]
-    speed, curvature = reference_profiles(x, y, heading, tracker)
-    steps = speed.shape[-1]
-    windows = jnp.asarray(_window_matrix(steps), x.dtype)
-    moments = jnp.einsum("mkj,pj->mkp", windows, curvature, precision=jax.lax.Precision.HIGHEST)
-    target = np.minimum(np.arange(steps) + HORIZON, steps - 1)
-    reference = {
-        "x": x[:, :-1].T,
-        "y": y[:, :-1].T,
-        "heading": heading[:, :-1].T,
-        "cos": jnp.cos(heading[:, :-1]).T,
-        "sin": jnp.sin(heading[:, :-1]).T,
-        "speed": speed[:, target].T,
-        "moments": jnp.moveaxis(moments, 1, 0),
-    }
+    reference = reference_at(x, y, heading, tracker)
     start = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v, x.dtype), (num,)), initial)
 
     def step(state, ref):

@@ -75,6 +75,14 @@ class Report:
             Row(file, array, 0.0, int(different.sum()), int(different.size), None, note)
         )
 
+    def add_loader_row(self, file, row):
+        """Takes over a row of the readers' own table; their discrete outputs must all agree."""
+        tolerance = row.tolerance if not row.mismatches else -1.0
+        note = f"{row.mismatches} discrete differences" if row.mismatches else ""
+        self.rows.append(
+            Row(file, row.name, row.deviation, row.mismatches, row.count, tolerance, note)
+        )
+
     def failures(self) -> list[str]:
         """Continuous rows out of tolerance, and discrete arrays whose pooled share is too large."""
         failed = [
