@@ -48,7 +48,8 @@ def intersection(
     connector = f"south>{target_arm(turn)}/{0 if turn == 'left' else 1}"
     stage = approach(builder, [connector], distance, speed, speed_limit)
     line = stage.ego.station + EGO_FRONT + distance - 1.0
-    stage.ego = dataclasses.replace(stage.ego, give_way=line)
+    # Traffic from the north goes before a left turn.
+    stage.ego = dataclasses.replace(stage.ego, give_way=line, rank=2)
     _cross_traffic(rng, stage, 2, spacing, speed, speed_limit)
     pavement_walks(rng, stage, arms, 2)
     return stage

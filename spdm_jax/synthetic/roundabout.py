@@ -35,7 +35,7 @@ def roundabout(
     distance: float = 30.0,
     speed: float = 7.0,
     speed_limit: float = 8.3,
-    spacing: float = 45.0,
+    spacing: float = 32.0,
 ) -> Stage:
     """A roundabout with one lane; whoever enters gives way to the ring.
 

@@ -59,6 +59,7 @@ class Follower:
       type: class.
       gates: (station, connector) pairs of the stop lines of lights.
       give_way: station of the line at which to give way to crossing traffic, m.
+      rank: of two drivers who both wait at such lines, the one with the lower rank goes first.
     """
 
     path: Path
@@ -69,6 +70,7 @@ class Follower:
     type: ObjectType = ObjectType.VEHICLE
     gates: tuple[tuple[float, str], ...] = ()
     give_way: float | None = None
+    rank: int = 1
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,8 @@ class _Traffic:
         sizes = [(float(EGO.length), float(EGO.width)), *(d.size for d in followers)]
         self.half = np.array(sizes) / 2
         self.desired = np.array([d.desired_speed for d in self.drivers])
-        self.waits = np.array([d.give_way is not None for d in self.drivers])
+        lines = [-np.inf if d.give_way is None else d.give_way for d in self.drivers]
+        self.lines, self.rank = np.array(lines), np.array([d.rank for d in self.drivers])
         # The ego's station is its rear axle's; all other boxes are centred on theirs.
         self.to_center = np.zeros(len(self.drivers))
         self.to_center[0] = float(EGO.rear_axle_to_center)
@@ -270,18 +273,21 @@ class _Traffic:
         return stops
 
     def _crossing(self, driver: int, step: int) -> bool:
-        """Returns whether another driver (but the ego) will cross the path of `driver`.
+        """Returns whether another driver will cross the path of `driver`.
 
-        The others are expected to keep their speed, or to set off where they give way themselves.
+        The others are expected to keep their speed. Of those before a give-way line of their own
+        only lower ranks count, and these are expected to set off.
         """
-        others = (self.speed[:, step] > 0.0) | self.waits
+        fronts = self.station[:, step] + self.to_center + self.half[:, 0]
+        waiting = fronts < self.lines
+        others = np.where(waiting, self.rank < self.rank[driver], self.speed[:, step] > 0.0)
         others &= ~self._gone(step)
-        others[[0, driver]] = False
+        others[driver] = False
         who = np.flatnonzero(others)
         if not who.size:
             return False
         keep = self.speed[who, step, None] * LOOKAHEAD
-        way = np.where(self.waits[who, None], self._way(who, step, LOOKAHEAD), keep)
+        way = np.where(waiting[who, None], self._way(who, step, LOOKAHEAD), keep)
         future = self.station[who, step, None] + way
         pose = self.centers(who[:, None], future).reshape(-1, 3)
         half = np.repeat(self.half[who], len(LOOKAHEAD), axis=0)

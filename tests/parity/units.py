@@ -17,6 +17,7 @@ from spdm_jax.geometry import (
     ego_box,
     interpolate,
     make_path,
+    point_segment_sq,
     project,
 )
 from spdm_jax.planner import brake_trajectory, cast_params, target_speeds
@@ -187,8 +188,10 @@ def _path(name, d, report, dtype, tol):
         at = project(path, query[:, 0], query[:, 1])
         report.close(name, f"query_progress {row}", at, d["query_progress"][mine], tol * 10,
                      robust[mine])
-        x, y, _ = interpolate(path, at)
-        distance = np.hypot(np.asarray(x) - query[:, 0], np.asarray(y) - query[:, 1])
+        square, _ = point_segment_sq(
+            query[:, :1], query[:, 1:], path.x[:-1], path.y[:-1], path.x[1:], path.y[1:]
+        )
+        distance = np.sqrt(np.asarray(square)[:, : b - a - 1].min(1))
         report.close(name, f"query_distance {row}", distance, d["query_distance"][mine], tol)
         mine = np.asarray(d["interp_path"]) == row
         pose = np.stack(interpolate(path, jnp.asarray(d["interp_distance"][mine], dtype)), -1)
