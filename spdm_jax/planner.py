@@ -245,7 +245,7 @@ def notice(
     )
 
 
-def _see(
+def see(
     scene: Scenario,
     given: StepInput,
     state: PlannerState,
@@ -560,7 +560,7 @@ def step(
     params = cast_params(params, ego.x.dtype)
     box = ego_box(ego, params.vehicle)
     with jax.named_scope("see"):
-        seen = _see(scene, given, state, params, config)
+        seen = see(scene, given, state, params, config)
         lanes, parks = drivable_lanes(scene.map, box.x, box.y, params.map_radius)
         lane = starting_lane(scene.map, scene.route, lanes, ego, params.vehicle)
         masks = area_masks(scene.map, scene.route.lane_on_route, lanes, parks)

@@ -73,9 +73,9 @@ def red_light(
       ValueError: the distance is outside 2 ... 150 m, or too short for the queue.
     """
     count = int(rng.integers(3)) if queued is None else queued
-    if distance < 8.0 * count + 5.0:
+    if distance < 10.0 * count + 5.0:
         raise ValueError(
-            f"distance is {distance} m and queued {count}; a queue needs 8 m per vehicle and 5 m "
+            f"distance is {distance} m and queued {count}; a queue needs 10 m per vehicle and 5 m "
             "more, raise distance or lower queued"
         )
     builder, arms = _crossing(rng, lanes=2, radius=17.0, speed_limit=speed_limit, light=True)
@@ -96,7 +96,7 @@ def red_light(
     stage = approach(builder, ["south>north/1"], distance, speed, speed_limit, lights)
     front = stage.ego.station + EGO_FRONT + distance
     for i in range(count):
-        station = front - 4.5 - 7.5 * i
+        station = front - 7.0 - 9.5 * i
         stage.followers.append(
             vehicle(rng, stage.ego.path, station, 0.0, speed_limit, stage.ego.gates)
         )
@@ -249,7 +249,7 @@ def _cross_traffic(
                 rng,
                 path,
                 end - (160.0 if stage.lights else 110.0),
-                end - (35.0 if minor else 5.0),
+                end - (35.0 if minor else 8.0),
                 spacing,
                 speed=0.0 if stage.lights and source == "north" else speed,
                 desired_speed=(0.9 if stage.lights or minor else 0.75) * speed_limit,

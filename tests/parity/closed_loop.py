@@ -22,15 +22,24 @@ CONFIG = PlannerConfig()
 
 
 @partial(jax.jit, static_argnames=("config",))
-def _step(ego, observation: Observation, collided, red, paths, speed_limit, grid, masks, params,
-          config):
+def _step(
+    ego, observation: Observation, collided, red, paths, speed_limit, grid, masks, params, config
+):
     box = ego_box(ego, params.vehicle)
     selected = select_objects(observation, box.x, box.y, collided, params.map_radius, config)
     poses = constant_velocity(observation, selected)
     seen = notice(ego, observation, selected, poses, red, params.vehicle, config)
     center = jax.tree.map(lambda v: v[0], paths)
     decision = decide(
-        ego, paths, target_speeds(speed_limit, params), seen, None, grid, masks, center, params,
+        ego,
+        paths,
+        target_speeds(speed_limit, params),
+        seen,
+        None,
+        grid,
+        masks,
+        center,
+        params,
         config,
     )
     size = collided.shape[0]
@@ -39,7 +48,12 @@ def _step(ego, observation: Observation, collided, red, paths, speed_limit, grid
     )
     plan = decision.trajectory
     states, _ = track(
-        plan.x[None], plan.y[None], plan.heading[None], ego, params.vehicle, params.tracker,
+        plan.x[None],
+        plan.y[None],
+        plan.heading[None],
+        ego,
+        params.vehicle,
+        params.tracker,
         config.tracker,
     )
     following = jax.tree.map(lambda v: v[0, 1], states)
@@ -72,15 +86,26 @@ def replay(path: Path, report, dtype) -> None:
     note = f"{steps} steps"
     for i in range(steps):
         masks = area_masks(
-            data["drivable_active"][i], data["drivable_on_route"], len(drivable), len(crossings),
+            data["drivable_active"][i],
+            data["drivable_on_route"],
+            len(drivable),
+            len(crossings),
             grid.masks.shape[1],
         )
         observation = observation_of(base, world, dtype, data["raw_pose"][i])
         if collided is None:
             collided = jnp.zeros(observation.x.shape, bool)
         decision, collided, inside, following = _step(
-            ego, observation, collided, red, world.paths,
-            jnp.asarray(data["speed_limit"][i], dtype), grid, masks, params, config=CONFIG,
+            ego,
+            observation,
+            collided,
+            red,
+            world.paths,
+            jnp.asarray(data["speed_limit"][i], dtype),
+            grid,
+            masks,
+            params,
+            config=CONFIG,
         )
         red = red.replace(ignored=red.ignored | inside)
         keep("loop ego_states", state_array(ego, world.origin), data["ego_states"][i])
@@ -95,15 +120,24 @@ def replay(path: Path, report, dtype) -> None:
         keep("loop multi_metrics", np.stack(multi), data["multi_metrics"][i])
         keep("loop best_index", best, theirs)
         keep("loop emergency_brake", bool(decision.emergency_brake), data["emergency_brake"][i])
-        keep("loop collided", np.asarray(collided)[: data["collided_raw"].shape[1]],
-             data["collided_raw"][i])
-        keep("loop trajectories", state_array(decision.trajectory, world.origin)[:, :3],
-             data["trajectories"][i])
+        keep(
+            "loop collided",
+            np.asarray(collided)[: data["collided_raw"].shape[1]],
+            data["collided_raw"][i],
+        )
+        keep(
+            "loop trajectories",
+            state_array(decision.trajectory, world.origin)[:, :3],
+            data["trajectories"][i],
+        )
         ego = following
     else:
         keep("loop ego_states", state_array(ego, world.origin), data["final_ego_state"])
-    tolerances = {"loop ego_states": state_tol, "loop trajectories": state_tol * 10,
-                  "loop scores": score_tol}
+    tolerances = {
+        "loop ego_states": state_tol,
+        "loop trajectories": state_tol * 10,
+        "loop scores": score_tol,
+    }
     for array, pairs in collected.items():
         ours, reference = (np.stack(v) for v in zip(*pairs, strict=True))
         if array in tolerances:

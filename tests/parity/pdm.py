@@ -182,9 +182,17 @@ def check_scene(path: FilePath, report, dtype) -> None:
     def pose_rows(ours, reference, array, tolerance, mask=None):
         ours = np.asarray(ours, float)
         shift = world.origin
-        report.close(name, f"{array} xy", ours[..., :2] + shift, reference[..., :2], tolerance,
-                     None if mask is None else mask[..., None])
-        report.close(name, f"{array} heading", ours[..., 2], reference[..., 2], tolerance, mask, True)
+        report.close(
+            name,
+            f"{array} xy",
+            ours[..., :2] + shift,
+            reference[..., :2],
+            tolerance,
+            None if mask is None else mask[..., None],
+        )
+        report.close(
+            name, f"{array} heading", ours[..., 2], reference[..., 2], tolerance, mask, True
+        )
 
     # Observation and forecast.
     observation = observation_of(data, world, dtype)
@@ -192,8 +200,9 @@ def check_scene(path: FilePath, report, dtype) -> None:
     excluded = jnp.zeros(observation.x.shape, bool)
     selected = _select(observation, center.x, center.y, excluded, params.map_radius, config=CONFIG)
     picked = np.asarray(selected.track)[np.asarray(selected.valid)]
-    report.equal(name, "obj_raw_index", _same_length(picked, data["obj_raw_index"]),
-                 data["obj_raw_index"])
+    report.equal(
+        name, "obj_raw_index", _same_length(picked, data["obj_raw_index"]), data["obj_raw_index"]
+    )
     poses = constant_velocity(observation, selected)
     supplied_forecast = name.startswith("scene_fc_")
     if not supplied_forecast and len(picked) == world.num_objects:
@@ -206,10 +215,19 @@ def check_scene(path: FilePath, report, dtype) -> None:
     touching = np.concatenate(
         [np.asarray(seen_now.touching)[: len(picked)], np.asarray(seen_now.inside)[:lights]]
     )
-    report.equal(name, "initially_collided", _same_length(touching, data["initially_collided"]),
-                 data["initially_collided"])
-    report.close(name, "target_velocity", target_speeds(jnp.asarray(data["speed_limit"], dtype),
-                 params), targets, state_tol)
+    report.equal(
+        name,
+        "initially_collided",
+        _same_length(touching, data["initially_collided"]),
+        data["initially_collided"],
+    )
+    report.close(
+        name,
+        "target_velocity",
+        target_speeds(jnp.asarray(data["speed_limit"], dtype), params),
+        targets,
+        state_tol,
+    )
 
     # Paths.
     center_path = jax.tree.map(lambda v: v[0], world.paths)
@@ -234,8 +252,16 @@ def check_scene(path: FilePath, report, dtype) -> None:
     report.close(name, "corridor_progress", ours, data["corridor_progress"], state_tol * 10, hit)
     stored = stored_contents(data, world, dtype)
     rolled, pose = _rollout(
-        world.paths, start, ego.vx, targets, world.forecast, world.red, stored,
-        world.vehicle, world.idm, num_states=41,
+        world.paths,
+        start,
+        ego.vx,
+        targets,
+        world.forecast,
+        world.red,
+        stored,
+        world.vehicle,
+        world.idm,
+        num_states=41,
     )
     flat = lambda v: np.asarray(v, float).reshape(num, -1)
     idm_state = np.stack([flat(rolled.progress), flat(rolled.speed)], -1)
@@ -258,25 +284,47 @@ def check_scene(path: FilePath, report, dtype) -> None:
     report.close(name, "ref_velocity_profile", speed, data["ref_velocity_profile"], state_tol)
     report.close(name, "ref_curvature_profile", curvature, data["ref_curvature_profile"], state_tol)
     states, commands = _track(
-        reference.x, reference.y, reference.heading, ego, world.vehicle,
-        cast_params(PlannerParams(), dtype).tracker, tracker="reference",
+        reference.x,
+        reference.y,
+        reference.heading,
+        ego,
+        world.vehicle,
+        cast_params(PlannerParams(), dtype).tracker,
+        tracker="reference",
     )
     report.close(name, "lqr_commands", commands, data["lqr_commands"], state_tol * 10)
-    _compare_states(report, name, "sim_states", state_array(states, world.origin),
-                    data["sim_states"], state_tol)
+    _compare_states(
+        report, name, "sim_states", state_array(states, world.origin), data["sim_states"], state_tol
+    )
 
     # Scoring.
     simulated = ego_state(data["sim_states"], world.origin, dtype)
     box = ego_box(simulated, world.vehicle)
-    report.close(name, "ego_corners", np.stack([box.x, box.y], -1) + world.origin,
-                 data["ego_corners"][:, :, 4], state_tol)
+    report.close(
+        name,
+        "ego_corners",
+        np.stack([box.x, box.y], -1) + world.origin,
+        data["ego_corners"][:, :, 4],
+        state_tol,
+    )
     valid = jnp.ones(num, bool)
     scored = _score(
-        simulated, valid, World(world.grid, world.masks, world.forecast, center_path),
-        world.vehicle, params.scoring,
+        simulated,
+        valid,
+        World(world.grid, world.masks, world.forecast, center_path),
+        world.vehicle,
+        params.scoring,
     )
-    compare_scores(report, name, "", scored, data, robust=robust, robust_areas=robust_areas,
-                   tolerance=state_tol)
+    compare_scores(
+        report,
+        name,
+        "",
+        scored,
+        data,
+        robust=robust,
+        robust_areas=robust_areas,
+        tolerance=state_tol,
+    )
     _compare_events(report, name, simulated, scored, world, params, data, robust)
     combined = aggregate(
         jnp.asarray(np.prod(data["multi_metrics"], 0), dtype),
@@ -286,17 +334,30 @@ def check_scene(path: FilePath, report, dtype) -> None:
         valid,
         params.scoring,
     )
-    report.close(name, "aggregate", combined.total, data["scores"],
-                 limits.SCORE_TOLERANCE[report.precision])
-    pose_rows(np.stack(brake_trajectory(ego, world.vehicle, params.brake), -1),
-              data["brake_trajectory"], "brake_trajectory", state_tol)
+    report.close(
+        name, "aggregate", combined.total, data["scores"], limits.SCORE_TOLERANCE[report.precision]
+    )
+    pose_rows(
+        np.stack(brake_trajectory(ego, world.vehicle, params.brake), -1),
+        data["brake_trajectory"],
+        "brake_trajectory",
+        state_tol,
+    )
 
     # The whole chain, from raw objects to the plan.
     if supplied_forecast:
         seen_now = seen
     decision = _decide(
-        ego, world.paths, targets, seen_now, None, world.grid, world.masks, center_path,
-        params, config=CONFIG,
+        ego,
+        world.paths,
+        targets,
+        seen_now,
+        None,
+        world.grid,
+        world.masks,
+        center_path,
+        params,
+        config=CONFIG,
     )
     chain_tol = limits.CHAIN_TOLERANCE[report.precision]
     chain_tol = max(chain_tol, state_tol) * (10 if report.precision == "f64" else 1)
@@ -304,14 +365,30 @@ def check_scene(path: FilePath, report, dtype) -> None:
     whole = untied.all(axis=1)
     ours = np.stack([decision.proposals.x, decision.proposals.y, decision.proposals.heading], -1)
     pose_rows(ours, data["proposal_states"], "chain proposal", chain_tol, untied)
-    _compare_states(report, name, "chain sim_states", state_array(decision.tracked, world.origin),
-                    data["sim_states"], chain_tol, whole[:, None])
-    compare_scores(report, name, "chain ", decision.scores, data, robust=robust & whole,
-                   robust_areas=robust_areas & whole[:, None], tolerance=chain_tol)
+    _compare_states(
+        report,
+        name,
+        "chain sim_states",
+        state_array(decision.tracked, world.origin),
+        data["sim_states"],
+        chain_tol,
+        whole[:, None],
+    )
+    compare_scores(
+        report,
+        name,
+        "chain ",
+        decision.scores,
+        data,
+        robust=robust & whole,
+        robust_areas=robust_areas & whole[:, None],
+        tolerance=chain_tol,
+    )
     best, theirs = int(decision.best), int(data["best_index"])
     compare_best(report, name, "chain best_index", best, data["scores"], theirs)
-    report.equal(name, "chain emergency_brake", bool(decision.emergency_brake),
-                 bool(data["emergency_brake"]))
+    report.equal(
+        name, "chain emergency_brake", bool(decision.emergency_brake), bool(data["emergency_brake"])
+    )
     if best == theirs and not data["lead_tie"][best].any():
         plan = state_array(decision.trajectory, world.origin)[:, :3] - [*world.origin, 0]
         pose_rows(plan, data["final_trajectory"], "chain final_trajectory", chain_tol * 2)
@@ -331,8 +408,9 @@ def _compare_states(report, name, array, ours, reference, tolerance, mask=None):
     if report.precision == "f64":
         weight = np.ones(11)
     wide = None if mask is None else mask[..., None]
-    report.close(name, array, (ours * weight)[..., plain], (reference * weight)[..., plain],
-                 tolerance, wide)
+    report.close(
+        name, array, (ours * weight)[..., plain], (reference * weight)[..., plain], tolerance, wide
+    )
     report.close(name, f"{array} heading", ours[..., 2], reference[..., 2], tolerance, mask, True)
 
 
@@ -374,8 +452,14 @@ def check_scorer(path: FilePath, report, dtype) -> None:
     )
     tolerance = limits.STATE_TOLERANCE[report.precision]
     compare_scores(
-        report, path.name, "random ", scored, data,
-        robust=robust, robust_areas=robust_areas, tolerance=tolerance,
+        report,
+        path.name,
+        "random ",
+        scored,
+        data,
+        robust=robust,
+        robust_areas=robust_areas,
+        tolerance=tolerance,
     )
 
 

@@ -42,7 +42,7 @@ def _plan(scene, params, config):
     params = planner.cast_params(params, scene.ego.x.dtype)
     box = ego_box(given.ego, params.vehicle)
     lanes, parks = drivable_lanes(scene.map, box.x, box.y, params.map_radius)
-    seen = planner._see(scene, given, state, params, config)
+    seen = planner.see(scene, given, state, params, config)
     targets = planner.target_speeds(
         scene.map.lanes.speed_limit[scene.route.start_lane[state.slot]], params
     )
@@ -68,9 +68,7 @@ def check_planning(path: Path, report, dtype) -> None:
     if iteration:
         scenario = start_at(scenario, info, iteration)
     origin = np.asarray(scenario.origin)
-    scene = jax.tree.map(
-        lambda v: v[0], to_device(batch([scenario], PaddingConfig()), dtype)
-    )
+    scene = jax.tree.map(lambda v: v[0], to_device(batch([scenario], PaddingConfig()), dtype))
     result, state, lanes, parks, seen, extended = _plan(scene, SPEC.params, config=SPEC.config)
     f64 = report.precision == "f64"
     tol = limits.CHAIN_TOLERANCE[report.precision] * (10 if f64 else 1)
@@ -81,8 +79,9 @@ def check_planning(path: Path, report, dtype) -> None:
     theirs = [str(v) for v in data["route_corrected"]]
     report.equal(name, "route_corrected", ours == theirs, True, note=f"{ours} / {theirs}")
     lane_ids = np.array(info.lane_ids)
-    report.equal(name, "starting_lane", lane_ids[int(result.starting_lane)],
-                 str(data["starting_lane"]))
+    report.equal(
+        name, "starting_lane", lane_ids[int(result.starting_lane)], str(data["starting_lane"])
+    )
     limit = scenario.map.lanes.speed_limit[int(result.starting_lane)]
     report.close(name, "speed_limit", limit, data["starting_lane_speed_limit"], 1e-9)
     center = data["centerline"]
@@ -92,8 +91,9 @@ def check_planning(path: Path, report, dtype) -> None:
         mine = np.stack([state.paths.x[0], state.paths.y[0]], -1)[:count] + origin
         report.close(name, "centerline", mine, center[:, :2], tol)
     red = sorted(int(lane_ids[i]) for i in np.asarray(seen.red.lane) if i >= 0)
-    report.equal(name, "red_connectors", red == sorted(map(int, data["red_connectors"])), True,
-                 note=str(red))
+    report.equal(
+        name, "red_connectors", red == sorted(map(int, data["red_connectors"])), True, note=str(red)
+    )
     mine = {str(lane_ids[i]) for i in np.flatnonzero(lanes) if i < len(lane_ids)}
     tokens = {str(v) for v in data["drivable_tokens"]}
     # Car parks have ids of their own layer, which the scenario file does not keep.
@@ -105,22 +105,28 @@ def check_planning(path: Path, report, dtype) -> None:
     corners = np.stack(boxes, -1) + origin  # [S, A, 4, 2]
     track_ids = np.array(info.track_ids)
     valid = np.asarray(seen.forecast.valid)
-    row_of = {str(track_ids[t]): i for i, t in enumerate(np.asarray(seen.forecast.track)) if valid[i]}
+    row_of = {
+        str(track_ids[t]): i for i, t in enumerate(np.asarray(seen.forecast.track)) if valid[i]
+    }
     stored = {}
     for step, object_token, ring in zip(
         data["forecast_step"], data["forecast_token"], data["forecast_corners"], strict=True
     ):
         stored.setdefault(str(object_token), []).append((int(step), ring[:4]))
     objects = {k for k in stored if "red_light" not in k}
-    report.equal(name, "forecast objects", set(row_of) == objects, True,
-                 note=str(set(row_of) ^ objects))
+    report.equal(
+        name, "forecast objects", set(row_of) == objects, True, note=str(set(row_of) ^ objects)
+    )
     worst = 0.0
     for object_token in objects & set(row_of):
         for step, ring in stored[object_token]:
             mine = corners[step // 2, row_of[object_token]]
             # The stored ring may start at any corner.
-            gap = min(np.abs(np.roll(mine, k, 0)[:, :] - r).max() for k in range(4)
-                      for r in (ring, ring[::-1]))
+            gap = min(
+                np.abs(np.roll(mine, k, 0)[:, :] - r).max()
+                for k in range(4)
+                for r in (ring, ring[::-1])
+            )
             worst = max(worst, gap)
     report.close(name, "forecast_corners", worst, 0.0, tol)
 
@@ -138,13 +144,24 @@ def check_planning(path: Path, report, dtype) -> None:
     as_scene["ttc_time_idx"] = data["ttc_time_idcs"]
     as_scene["comfort_flags"] = np.asarray(result.scores.comfort_flags)  # not stored
     everywhere = np.ones(len(data["scores"]), bool)
-    compare_scores(report, name, "log ", result.scores, as_scene, robust=everywhere,
-                   robust_areas=np.ones(data["ego_areas"].shape[:2], bool), tolerance=tol)
-    report.close(name, "log scores 1e-6", result.scores.total, data["scores"], 1e-6 if f64 else 1e-3)
+    compare_scores(
+        report,
+        name,
+        "log ",
+        result.scores,
+        as_scene,
+        robust=everywhere,
+        robust_areas=np.ones(data["ego_areas"].shape[:2], bool),
+        tolerance=tol,
+    )
+    report.close(
+        name, "log scores 1e-6", result.scores.total, data["scores"], 1e-6 if f64 else 1e-3
+    )
     best, theirs = int(result.best), int(data["best"])
     compare_best(report, name, "log best", best, data["scores"], theirs)
-    report.equal(name, "log emergency_brake", bool(result.emergency_brake),
-                 bool(data["emergency_brake"]))
+    report.equal(
+        name, "log emergency_brake", bool(result.emergency_brake), bool(data["emergency_brake"])
+    )
     if best == theirs:
         plan = result.trajectory
         mine = np.stack([plan.x, plan.y], -1) + origin

@@ -57,9 +57,7 @@ def _params(dtype) -> PlannerParams:
 
 
 def _lqr(name, d, report, dtype, tol):
-    params = _params(dtype).replace(
-        tracker=TrackerParams(wheel_base=float(d["wheel_base"]))
-    )
+    params = _params(dtype).replace(tracker=TrackerParams(wheel_base=float(d["wheel_base"])))
     pose = [jnp.asarray(d["reference_se2"][..., i], dtype) for i in range(3)]
     # float32: a local frame first, as everywhere in the library.
     origin = d["reference_se2"][:, 0, :2]
@@ -71,9 +69,12 @@ def _lqr(name, d, report, dtype, tol):
     # Accelerations and curvature rates are the fit's own unknowns: differences over 0.1 s.
     difference = lambda v: np.diff(np.asarray(v, float), axis=1) / 0.1
     rate_tol = tol * (10 if report.precision == "f32" else 1)
-    report.close(name, "acceleration_profile", difference(speed), d["acceleration_profile"], rate_tol)
-    report.close(name, "curvature_rate_profile", difference(curvature), d["curvature_rate_profile"],
-                 rate_tol)
+    report.close(
+        name, "acceleration_profile", difference(speed), d["acceleration_profile"], rate_tol
+    )
+    report.close(
+        name, "curvature_rate_profile", difference(curvature), d["curvature_rate_profile"], rate_tol
+    )
     start = np.array(d["initial_states"])
     start[:, :2] -= origin
     states, commands = track(
@@ -97,7 +98,9 @@ def _lqr(name, d, report, dtype, tol):
         at = jax.tree.map(lambda v, k=index: v[k], reference)
         accel, rate = lqr._command(initial, at, params.tracker)
         ours = np.stack([accel, rate], -1)
-        report.close(name, f"commands_at_index {index}", ours, d["commands_at_index"][row], tol * 10)
+        report.close(
+            name, f"commands_at_index {index}", ours, d["commands_at_index"][row], tol * 10
+        )
 
 
 def _bicycle(name, d, report, dtype, tol):
@@ -153,11 +156,13 @@ def _comfort(name, d, report, dtype, tol):
     fields["heading"] = jnp.asarray(d["heading"], dtype)
     fields["ax"], fields["ay"] = jnp.asarray(d["accel_x"], dtype), jnp.asarray(d["accel_y"], dtype)
     ego = EgoState(**fields)
-    names = dict(zip(
-        ("lon_accel", "lat_accel", "jerk", "lon_jerk", "yaw_accel", "yaw_rate"),
-        ("lon_accel", "lat_accel", "mag_jerk", "lon_jerk", "yaw_accel", "yaw_rate"),
-        strict=True,
-    ))
+    names = dict(
+        zip(
+            ("lon_accel", "lat_accel", "jerk", "lon_jerk", "yaw_accel", "yaw_rate"),
+            ("lon_accel", "lat_accel", "mag_jerk", "lon_jerk", "yaw_accel", "yaw_rate"),
+            strict=True,
+        )
+    )
     bounds = np.asarray(d["bounds"])
     near = np.zeros((len(d["heading"]), 6), bool)
     for column, (ours, signal) in enumerate(zip(names, comfort_signals(ego).values(), strict=True)):
@@ -179,15 +184,22 @@ def _path(name, d, report, dtype, tol):
     for row, (a, b) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
         columns = [jnp.asarray(pad(points[a:b, i], size), dtype) for i in range(3)]
         path = make_path(*columns, jnp.asarray(b - a, jnp.int32))
-        report.close(name, f"path_progress {row}", path.progress[: b - a], d["path_progress"][a:b],
-                     tol)
-        report.close(name, f"path_points_unwrapped {row}", path.heading[: b - a],
-                     d["path_points_unwrapped"][a:b, 2], tol)
+        report.close(
+            name, f"path_progress {row}", path.progress[: b - a], d["path_progress"][a:b], tol
+        )
+        report.close(
+            name,
+            f"path_points_unwrapped {row}",
+            path.heading[: b - a],
+            d["path_points_unwrapped"][a:b, 2],
+            tol,
+        )
         mine = np.asarray(d["query_path"]) == row
         query = jnp.asarray(d["query_points"][mine], dtype)
         at = project(path, query[:, 0], query[:, 1])
-        report.close(name, f"query_progress {row}", at, d["query_progress"][mine], tol * 10,
-                     robust[mine])
+        report.close(
+            name, f"query_progress {row}", at, d["query_progress"][mine], tol * 10, robust[mine]
+        )
         square, _ = point_segment_sq(
             query[:, :1], query[:, 1:], path.x[:-1], path.y[:-1], path.x[1:], path.y[1:]
         )
@@ -196,8 +208,9 @@ def _path(name, d, report, dtype, tol):
         mine = np.asarray(d["interp_path"]) == row
         pose = np.stack(interpolate(path, jnp.asarray(d["interp_distance"][mine], dtype)), -1)
         report.close(name, f"interp xy {row}", pose[:, :2], d["interp_se2"][mine][:, :2], tol)
-        report.close(name, f"interp heading {row}", pose[:, 2], d["interp_se2"][mine][:, 2], tol,
-                     None, True)
+        report.close(
+            name, f"interp heading {row}", pose[:, 2], d["interp_se2"][mine][:, 2], tol, None, True
+        )
         for i, offset in enumerate(np.asarray(d["parallel_offset"])):
             moved = parallel_path(path, jnp.asarray(offset, dtype))
             ours = np.stack([moved.x, moved.y], -1)[: b - a]
@@ -218,8 +231,12 @@ def _aggregate(name, d, report, dtype, tol):
     for i in range(len(d["scores"])):
         get = lambda key, row=i: jnp.asarray(d[key][row], dtype)
         ours = aggregate(
-            jnp.prod(get("multi_metrics"), axis=0), get("progress_raw"), get("ttc"),
-            get("comfortable"), jnp.ones(d["ttc"].shape[1], bool), params,
+            jnp.prod(get("multi_metrics"), axis=0),
+            get("progress_raw"),
+            get("ttc"),
+            get("comfortable"),
+            jnp.ones(d["ttc"].shape[1], bool),
+            params,
         )
         report.close(name, "normalized_progress", ours.progress, d["normalized_progress"][i], tol)
         report.close(name, "scores", ours.total, d["scores"][i], tol)
@@ -249,24 +266,40 @@ def _geometry(name, d, report, dtype, tol):
     report.equal(name, "intersects", hits, d["intersects"], robust)
     report.close(name, "distance", box_distance(box, boxes), distance, tol, robust)
     bumper = Box(
-        box.x + box.half_length * box.cos, box.y + box.half_length * box.sin, box.cos, box.sin,
-        jnp.zeros_like(box.x), box.half_width,
+        box.x + box.half_length * box.cos,
+        box.y + box.half_length * box.sin,
+        box.cos,
+        box.sin,
+        jnp.zeros_like(box.x),
+        box.half_width,
     )
-    report.equal(name, "front_edge_hits", boxes_overlap(bumper, boxes), d["front_edge_hits"], robust)
+    report.equal(
+        name, "front_edge_hits", boxes_overlap(bumper, boxes), d["front_edge_hits"], robust
+    )
     cos = _cos_to_object(ego.x, ego.y, ego.heading, ox, oy)
     angle = np.arccos(np.clip(np.asarray(cos, float), -1, 1))
-    report.close(name, "relative_angle", angle, d["relative_angle"], tol * (10 if f32 else 1),
-                 np.abs(np.sin(np.asarray(d["relative_angle"]))) > 1e-2)
+    report.close(
+        name,
+        "relative_angle",
+        angle,
+        d["relative_angle"],
+        tol * (10 if f32 else 1),
+        np.abs(np.sin(np.asarray(d["relative_angle"]))) > 1e-2,
+    )
     for key, ours, limit in (
-        ("ahead", _is_ahead(cos, params.scoring), 30), ("behind", _is_behind(cos, params.scoring), 150)
+        ("ahead", _is_ahead(cos, params.scoring), 30),
+        ("behind", _is_behind(cos, params.scoring), 150),
     ):
         far = np.abs(np.degrees(np.asarray(d["relative_angle"])) - limit) > (1e-3 if f32 else 1e-9)
         report.equal(name, key, ours, d[key], far)
     # Collision type of each pair on its own: one ego state, one object, contact at once.
     forecast = AgentForecast(
-        x=ox[:, None, None], y=oy[:, None, None], heading=other[2][:, None, None],
+        x=ox[:, None, None],
+        y=oy[:, None, None],
+        heading=other[2][:, None, None],
         sample_valid=jnp.ones((len(distance), 1, 1), bool),
-        length=other[3][:, None], width=other[4][:, None],
+        length=other[3][:, None],
+        width=other[4][:, None],
         type=jnp.asarray(d["box_type"], jnp.int32)[:, None],
         is_agent=jnp.asarray(np.asarray(d["box_type"]) <= 2)[:, None],
         speed=jnp.asarray(d["box_speed"], dtype)[:, None],
@@ -284,7 +317,9 @@ def _geometry(name, d, report, dtype, tol):
             one, EgoAreas(none, none, none), agents, contacts, params.vehicle, params.scoring
         ).pair_kind[0, 0]
 
-    report.equal(name, "collision_type", jax.vmap(kind_of)(ego, forecast), d["collision_type"], robust)
+    report.equal(
+        name, "collision_type", jax.vmap(kind_of)(ego, forecast), d["collision_type"], robust
+    )
 
     pip = np.asarray(d["pip_offsets"]).astype(int)
     rings = [np.asarray(d["pip_xy"])[a:b] for a, b in zip(pip[:-1], pip[1:], strict=True)]
