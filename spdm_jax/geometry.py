@@ -226,7 +226,9 @@ def interpolate(path: Path, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
     Source: tuplan_garage `PDMPath.interpolate`.
     """
     s = jnp.clip(s, jnp.minimum(jnp.asarray(1e-5, s.dtype), path.length), path.length)
-    index = jnp.sum(path.progress < s[..., None], axis=-1)
+    # Few points: count; many: bisect.
+    method = "compare_all" if s.size < 128 else "scan_unrolled"
+    index = jnp.searchsorted(path.progress, s, side="left", method=method)
     index = jnp.clip(index, 1, jnp.maximum(path.count - 1, 1))
     p0, p1 = path.progress[index - 1], path.progress[index]
     span = p1 - p0

@@ -16,12 +16,19 @@ from spdm_jax.geometry import (
     boxes_overlap,
     crosses_upward_ray,
     interpolate,
+    project,
     segment_meets_box,
 )
 from spdm_jax.types import AgentForecast
 
 # The reference's round joins have 16 segments per quarter circle (shapely's quad_segs).
 _JOIN_ANGLE = jnp.pi / 2 / 16
+BLOCK = 8
+"""Segments in a run that is compared as one circle first."""
+PAIRS = 512
+"""(run, box) pairs tested exactly at a time."""
+POINTS = 128
+"""Points projected at a time."""
 
 
 class Corridor(NamedTuple):
@@ -161,15 +168,82 @@ def _piece_meets_box(piece: _Segments, box: Box) -> jax.Array:
     return (hit | wedge) & piece.used
 
 
-def corridor_hits_boxes(axis: Corridor, half_width: jax.Array, box: Box) -> jax.Array:
-    """Whether the corridor shares a point with boxes of any common shape `[...]`."""
-    pieces = _segments(axis, half_width)
+def _gathered(pieces: _Segments, path: jax.Array, segment: jax.Array) -> _Segments:
+    """Picks pieces by path and segment index (both broadcast)."""
+    return jax.tree.map(lambda v: v[path, segment], pieces)
 
-    def visit(i, hit):
-        return hit | _piece_meets_box(jax.tree.map(lambda v: v[i], pieces), box)
 
-    start = jnp.zeros(jnp.broadcast_shapes(*(jnp.shape(v) for v in box)), bool)
-    return jax.lax.fori_loop(0, jnp.maximum(axis.count - 1, 1), visit, start)
+class _Blocks(NamedTuple):
+    """Circles around runs of segments, `[L, M / BLOCK]` each."""
+
+    x: jax.Array
+    y: jax.Array
+    radius: jax.Array  # negative where the run has no used segment
+
+
+def _blocks(axes: Corridor, pieces: _Segments, half_width: jax.Array) -> _Blocks:
+    size = pieces.used.shape[1] // BLOCK
+    group = lambda v: v.reshape(v.shape[0], size, BLOCK)
+    used = group(pieces.used)
+    far = jnp.asarray(1e9, half_width.dtype)
+    x, y = group(pieces.box.x), group(pieces.box.y)
+    low = lambda v: jnp.min(jnp.where(used, v, far), axis=2)
+    high = lambda v: jnp.max(jnp.where(used, v, -far), axis=2)
+    cx, cy = 0.5 * (low(x) + high(x)), 0.5 * (low(y) + high(y))
+    reach = jnp.hypot(x - cx[..., None], y - cy[..., None]) + jnp.hypot(
+        group(pieces.box.half_length), half_width
+    )
+    # A wedge lies within half a width of a rectangle's end, hence inside the same circle.
+    radius = jnp.max(jnp.where(used, reach, -1), axis=2)
+    some = radius > 0
+    return _Blocks(jnp.where(some, cx, 0), jnp.where(some, cy, 0), radius)
+
+
+def corridors_hit_boxes(axes: Corridor, half_width: jax.Array, box: Box) -> jax.Array:
+    """Whether each corridor shares a point with each box.
+
+    Runs of segments and boxes are first compared as circles; the few pairs that are close are
+    collected and tested exactly, a fixed number at a time, until all are done.
+
+    Args:
+      axes: `[L, M]` corridors.
+      half_width: m.
+      box: `[N]` boxes.
+
+    Returns:
+      `[L, N]` bool.
+    """
+    num_boxes = box.x.shape[0]
+    pieces = jax.vmap(_segments, (0, None))(axes, half_width)
+    spare = -pieces.used.shape[1] % BLOCK
+    pieces = jax.tree.map(lambda v: jnp.pad(v, ((0, 0), (0, spare))), pieces)
+    blocks = _blocks(axes, pieces, half_width)
+    reach = jnp.hypot(box.half_length, box.half_width)
+    dx = blocks.x[..., None] - box.x
+    dy = blocks.y[..., None] - box.y
+    limit = blocks.radius[..., None] + reach
+    # A little slack: rounding must not lose a touching pair.
+    near = (dx * dx + dy * dy <= limit * limit * 1.0001) & (blocks.radius > 0)[..., None]
+    shape = near.shape  # [L, blocks, N]
+    order = jnp.cumsum(near.reshape(-1).astype(jnp.int32))
+    total = order[-1]
+    lane = jnp.arange(BLOCK)
+
+    def some_pairs(carry):
+        chunk, hit = carry
+        wanted = chunk * PAIRS + jnp.arange(PAIRS, dtype=jnp.int32)
+        index = jnp.searchsorted(order, wanted + 1, method="scan")
+        index = jnp.minimum(index, order.shape[0] - 1)
+        path, block, row = jnp.unravel_index(index, shape)
+        piece = _gathered(pieces, path[:, None], block[:, None] * BLOCK + lane)
+        target = jax.tree.map(lambda v: jnp.broadcast_to(v, (num_boxes,))[row][:, None], box)
+        touch = jnp.any(_piece_meets_box(piece, target), axis=1) & (wanted < total)
+        where = jnp.where(touch, path * num_boxes + row, hit.shape[0])
+        return chunk + 1, hit.at[where].set(True, mode="drop")
+
+    start = (jnp.int32(0), jnp.zeros(shape[0] * num_boxes, bool))
+    _, hit = jax.lax.while_loop(lambda carry: carry[0] * PAIRS < total, some_pairs, start)
+    return hit.reshape(shape[0], num_boxes)
 
 
 def corridor_hits_lights(axis: Corridor, half_width: jax.Array, red: RedLights) -> jax.Array:
@@ -207,21 +281,33 @@ def object_boxes(forecast: AgentForecast) -> Box:
     )
 
 
-def project_many(path: Path, px: jax.Array, py: jax.Array) -> jax.Array:
-    """`geometry.project` for many points, one path segment at a time (no `[..., M]` temporary)."""
+def project_where(paths: Path, px: jax.Array, py: jax.Array, wanted: jax.Array) -> jax.Array:
+    """`geometry.project` onto several paths, only where asked.
 
-    def visit(i, carry):
-        best, at = carry
-        ax, ay = path.x[i], path.y[i]
-        ux, uy = path.x[i + 1] - ax, path.y[i + 1] - ay
-        square = ux * ux + uy * uy
-        vx, vy = px - ax, py - ay
-        t = jnp.clip((vx * ux + vy * uy) / jnp.where(square > 0, square, 1), 0, 1)
-        ex, ey = vx - t * ux, vy - t * uy
-        distance = ex * ex + ey * ey
-        closer = distance < best
-        start, end = path.progress[i], path.progress[i + 1]
-        return jnp.where(closer, distance, best), jnp.where(closer, start + t * (end - start), at)
+    Args:
+      paths: `[L, M]` paths.
+      px: `[N]` points.
+      py: `[N]`.
+      wanted: `[L, N]` bool.
 
-    zero = jnp.zeros(px.shape, px.dtype)
-    return jax.lax.fori_loop(0, path.count - 1, visit, (zero + jnp.inf, zero))[1]
+    Returns:
+      `[L, N]` arc lengths, 0 where not asked.
+    """
+    num = px.shape[0]
+    order = jnp.cumsum(wanted.reshape(-1).astype(jnp.int32))
+    total = order[-1]
+
+    def some_points(carry):
+        chunk, out = carry
+        rank = chunk * POINTS + jnp.arange(POINTS, dtype=jnp.int32)
+        index = jnp.searchsorted(order, rank + 1, method="scan")
+        index = jnp.minimum(index, order.shape[0] - 1)
+        path, row = index // num, index % num
+        one = lambda p, x, y: project(jax.tree.map(lambda v: v[p], paths), x, y)
+        progress = jax.vmap(one)(path, px[row], py[row])
+        where = jnp.where(rank < total, index, out.shape[0])
+        return chunk + 1, out.at[where].set(progress, mode="drop")
+
+    start = (jnp.int32(0), jnp.zeros(order.shape[0], px.dtype))
+    _, out = jax.lax.while_loop(lambda carry: carry[0] * POINTS < total, some_points, start)
+    return out.reshape(wanted.shape)

@@ -12,15 +12,16 @@ from spdm_jax.geometry import (
     Path,
     box_distance,
     interpolate,
+    project,
     segment_box_distance,
     wrap,
 )
 from spdm_jax.proposals.corridor import (
     corridor_axis,
-    corridor_hits_boxes,
     corridor_hits_lights,
+    corridors_hit_boxes,
     object_boxes,
-    project_many,
+    project_where,
 )
 from spdm_jax.types import AgentForecast
 
@@ -128,22 +129,35 @@ def corridor_contents(
     boxes = object_boxes(forecast)
     half_width = jnp.asarray(0.5 * vehicle.width, paths.x.dtype)
     present = (forecast.sample_valid & forecast.valid[:, None]).T
+    reach = max_speed * PLAN_SECONDS
+    axes = jax.vmap(lambda path, begin: corridor_axis(path, begin, begin + reach))(paths, start)
 
-    def one_path(path, begin):
-        axis = corridor_axis(path, begin, begin + max_speed * PLAN_SECONDS)
-        hit = corridor_hits_boxes(axis, half_width, boxes) & present
-        light = corridor_hits_lights(axis, half_width, red)
-        progress = project_many(path, boxes.x, boxes.y)
-        light_progress = project_many(path, red.centroid[:, 0], red.centroid[:, 1])
-        shape = (hit.shape[0], light.shape[0])
-        return (
-            jnp.concatenate([hit, jnp.broadcast_to(light, shape)], axis=1),
-            jnp.concatenate([progress, jnp.broadcast_to(light_progress, shape)], axis=1),
-        )
+    flat = jax.tree.map(lambda v: v.reshape(-1), boxes)
+    shape = (start.shape[0], *present.shape)
+    hit = corridors_hit_boxes(axes, half_width, flat).reshape(shape) & present
+    progress = project_where(paths, flat.x, flat.y, hit.reshape(shape[0], -1)).reshape(shape)
 
-    hit, progress = jax.lax.map(lambda args: one_path(*args), (paths, start))
-    rank = jnp.arange(hit.shape[-1], dtype=jnp.int32)
-    return CorridorContents(hit, progress, rank)
+    num_lights = red.valid.shape[0]
+
+    def lights():
+        inside = jax.lax.map(lambda axis: corridor_hits_lights(axis, half_width, red), axes)
+        at = jax.vmap(lambda path: project(path, red.centroid[:, 0], red.centroid[:, 1]))(paths)
+        return inside, at
+
+    def no_lights():
+        empty = jnp.zeros((shape[0], num_lights), bool)
+        return empty, empty.astype(paths.x.dtype)
+
+    light, light_progress = jax.lax.cond(jnp.any(red.valid), lights, no_lights)
+
+    def over_time(values):
+        return jnp.broadcast_to(values[:, None], (*shape[:2], num_lights))
+
+    return CorridorContents(
+        hit=jnp.concatenate([hit, over_time(light)], axis=2),
+        progress=jnp.concatenate([progress, over_time(light_progress)], axis=2),
+        rank=jnp.arange(shape[2] + num_lights, dtype=jnp.int32),
+    )
 
 
 class _Search(NamedTuple):
