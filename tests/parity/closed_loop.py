@@ -10,7 +10,7 @@ import shapely
 
 from spdm_jax.agents.forecast import constant_velocity
 from spdm_jax.agents.observation import Observation, select_objects
-from spdm_jax.config import PlannerConfig
+from spdm_jax.config import NUM_STATES, PlannerConfig
 from spdm_jax.geometry import ego_box
 from spdm_jax.planner import decide, notice, target_speeds
 from spdm_jax.tracking.lqr import track
@@ -46,15 +46,10 @@ def _step(
     collided = collided.at[jnp.where(seen.touching, seen.forecast.track, size)].set(
         True, mode="drop"
     )
-    plan = decision.trajectory
+    # The reference's simulator tracks the first 4 s.
+    plan = jax.tree.map(lambda v: v[None, :NUM_STATES], decision.trajectory)
     states, _ = track(
-        plan.x[None],
-        plan.y[None],
-        plan.heading[None],
-        ego,
-        params.vehicle,
-        params.tracker,
-        config.tracker,
+        plan.x, plan.y, plan.heading, ego, params.vehicle, params.tracker, config.tracker
     )
     following = jax.tree.map(lambda v: v[0, 1], states)
     return decision, collided, seen.inside, following

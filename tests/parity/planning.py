@@ -137,9 +137,7 @@ def check_planning(path: Path, report, dtype) -> None:
     reference = data["proposals"]
     stored_rows = np.any(reference[..., :2] != 0, axis=-1)
     mine = poses[..., :2] + origin
-    report.close(
-        name, "proposals xy", mine, reference[..., :2], tol * 2, stored_rows[..., None]
-    )
+    report.close(name, "proposals xy", mine, reference[..., :2], tol * 2, stored_rows[..., None])
     heading = poses[..., 2]
     report.close(name, "proposals heading", heading, reference[..., 2], tol, stored_rows, True)
     tracked = result.tracked
