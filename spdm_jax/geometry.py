@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from spdm_jax.arrays import prefix_sum
 from spdm_jax.types import EgoState
 
 
@@ -185,7 +186,7 @@ def unwrap_masked(angle: jax.Array, valid: jax.Array) -> jax.Array:
     """Unwraps angles along the last axis (NumPy's rule); `valid` is a prefix mask."""
     step = jnp.diff(angle, axis=-1)
     turns = jnp.where(valid[..., 1:], jnp.round(step / (2 * jnp.pi)), 0)
-    total = jnp.concatenate([jnp.zeros_like(angle[..., :1]), jnp.cumsum(turns, -1)], -1)
+    total = jnp.concatenate([jnp.zeros_like(angle[..., :1]), prefix_sum(turns)], -1)
     return angle - (2 * jnp.pi) * total
 
 
@@ -201,7 +202,7 @@ def make_path(x: jax.Array, y: jax.Array, heading: jax.Array, count: jax.Array) 
     heading = unwrap_masked(heading, valid)
     heading = jnp.where(valid, heading, heading[last])
     chord = jnp.hypot(jnp.diff(x), jnp.diff(y))
-    progress = jnp.concatenate([jnp.zeros_like(x[:1]), jnp.cumsum(chord)])
+    progress = jnp.concatenate([jnp.zeros_like(x[:1]), prefix_sum(chord)])
     length = progress[last]
     progress = jnp.where(valid, progress, jnp.asarray(PADDED_PROGRESS, x.dtype))
     return Path(x, y, heading, progress, count, length)

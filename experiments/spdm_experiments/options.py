@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 Format = Literal["auto", "nuplan", "av2", "synthetic"]
 PlannerName = Literal["spdm", "pdm-closed"]
+Forecast = Literal["constant_velocity", "perfect", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,26 +46,30 @@ class Planner(Compute):
 
     planner: PlannerName = "spdm"
     """SPDM or the baseline PDM-Closed."""
-    num_proposals: int = 60
-    """Proposals per scene: SPDM 15, 20, 25, ...; PDM-Closed 1, 3, 6, 15, 30 or 60."""
+    num_proposals: int | None = None
+    """Proposals per scene: SPDM 15, 20, 25, ... (60 if left out); PDM-Closed 1, 3, 6, 15, 30 or 60
+    (15 if left out)."""
     speeds: tuple[float, ...] = ()
     """Target speeds as fractions of the speed limit; the planner's own grid if left out."""
     offsets: tuple[float, ...] = ()
     """Lateral offsets in m, left positive, the first 0; the planner's own grid if left out."""
     tracker: Literal["reference", "corrected"] = "reference"
     """Velocity fit of the tracker: as published, or with its difference matrix repaired."""
-    forecast: Literal["constant_velocity", "perfect", "none"] = "constant_velocity"
+    forecast: Forecast = "constant_velocity"
     """Where the other agents' future comes from."""
+    progress_reference: Literal["auto", "centerline", "goal"] = "auto"
+    """What progress is measured along: the centreline (as published), the way to the goal, or the
+    first for PDM-Closed and the second for SPDM (auto)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Planner):
-    """Plan and score a built-in scene, write a page to look at. Needs no data."""
+class Demo(Compute):
+    """Plan the built-in scenes with SPDM (60) and PDM-Closed (15) and compare. Needs no data."""
 
-    scene: str = "parked_car"
-    """Name of the scene; an unknown one lists them all."""
+    scenes: tuple[str, ...] = ()
+    """These scenes only; an unknown one lists them all."""
     seed: int = 0
-    """Seed of the scene's traffic."""
+    """Seed of the scenes."""
     out: Path = Path("demo")
     """Folder to write."""
 
@@ -113,55 +118,77 @@ class Pack(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(Planner):
-    """Plan once per scenario, write the chosen trajectories with all proposals' scores."""
+class Chunked(Compute):
+    """Options of every verb that goes through a folder of scenarios."""
 
     scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
     """A folder of scenario files (see spdm pack), or one file."""
-    out: Path = Path("out/plan")
-    """Folder to write."""
     limit: int | None = None
-    """Take the first so many scenarios."""
-    chunk: int = 32
-    """Scenarios per device call; smaller needs less memory."""
+    """Take the first so many scenarios, in the order of their file names."""
+    chunk: int = 16
+    """Scenarios per device call: smaller needs less memory and reports more often."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score(Compute):
-    """Score given trajectories with the PDM sub-scores."""
+class Plan(Chunked, Planner):
+    """Plan once per scenario, write the chosen trajectories and all proposals' scores.
 
-    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
-    """A folder of scenario files (see spdm pack), or one file."""
-    trajectories: Annotated[Positional[Path], arg(metavar="TRAJECTORIES")]
-    """A .npy file: [S, P, T, 3] x, y, heading of the rear axle in each scene's local frame."""
+    Ctrl-C ends the run after the chunk at hand. What is done is in the folder by then. A scenario
+    that fails is listed with its reason; the exit code is then 1.
+    """
+
+    out: Path = Path("out/plan")
+    """Folder to write: rows.parquet, trajectories.npz, run.json, and pictures."""
+    html: int = 0
+    """Draw the first so many scenarios, of the first chunk at most, on one HTML page."""
+    png: int = 0
+    """Draw the first so many scenarios, of the first chunk at most, as PNG files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score(Chunked):
+    """Score given trajectories with the PDM sub-scores.
+
+    Ctrl-C ends the run after the chunk at hand. What is done is in the folder by then. A scenario
+    that fails is listed with its reason; the exit code is then 1.
+    """
+
+    trajectories: Annotated[Positional[Path], arg(metavar="TRAJ")]
+    """Rear-axle poses x, y, heading in a .npy or .npz file: [S, P, T, 3], one set per scenario in
+    the order of the file names, or [P, T, 3], the same in every scenario. A .npz file holds them as
+    "trajectories"; "tokens" [S] beside them says which scenario each set belongs to."""
     out: Path = Path("out/score")
-    """Folder to write."""
+    """Folder to write: rows.parquet and run.json."""
     dt: float = 0.1
-    """Spacing of the trajectories' states, s."""
-    shared: bool = False
-    """The file holds one set [P, T, 3] for all scenes, relative to the ego's pose."""
+    """Spacing of the trajectories' poses, s."""
+    frame: Literal["ego", "local", "global"] = "ego"
+    """Frame of the poses: the ego's current rear axle, the scenario's own, or the map's."""
     tracker: Literal["reference", "corrected", "none"] = "reference"
     """Track the trajectories first, as the planner does; none scores them as they are."""
-    forecast: Literal["constant_velocity", "perfect", "none"] = "constant_velocity"
+    forecast: Forecast = "constant_velocity"
     """Where the other agents' future comes from."""
-    limit: int | None = None
-    """Take the first so many scenarios."""
-    chunk: int = 32
-    """Scenarios per device call; smaller needs less memory."""
+    progress_reference: Literal["auto", "centerline", "goal"] = "auto"
+    """What progress is measured along: the centreline (auto, as published) or the way to the
+    goal."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show(Common):
-    """Write one HTML page that draws a scenario, with its plan if there is one."""
+class Show(Planner):
+    """Draw one scenario with its plan: an HTML page, a PNG file, or both.
 
-    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """A scenario file, or a folder of them together with --token."""
+    Without --html and --png a page TOKEN.html is written.
+    """
+
+    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
+    """A folder of scenario files (see spdm pack), or one file."""
+    index: int = 0
+    """Which one, in the order of the file names."""
     token: str | None = None
-    """The scenario of the folder to draw; the first one if left out."""
-    plans: Path | None = None
-    """Output folder of spdm plan."""
-    out: Path = Path("scene.html")
-    """File to write."""
+    """Which one, by its token."""
+    html: Path | None = None
+    """Page to write."""
+    png: Path | None = None
+    """Picture to write."""
 
 
 Options = Demo | Doctor | Pack | Plan | Score | Show

@@ -1,8 +1,23 @@
-"""Sets JAX up for one run of a verb: device, precision, compile cache."""
+"""One run of a verb: device, precision, compile cache, clocks, Ctrl-C and provenance."""
 
+import importlib.metadata
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from spdm_experiments.options import OnDevice
+
+_COMPILE_EVENTS = (
+    "/jax/core/compile/jaxpr_trace_duration",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "/jax/core/compile/backend_compile_duration",
+)
+_VERSIONED = ("spdm-jax", "jax", "jaxlib", "numpy", "shapely")
 
 
 def configure_jax(options: OnDevice, *, x64: bool) -> Path | None:
@@ -33,3 +48,116 @@ def configure_jax(options: OnDevice, *, x64: bool) -> Path | None:
             'the GPU build: pip install "jax[cuda12]"'
         ) from error
     return enable_compile_cache() if options.compile_cache else None
+
+
+@dataclass
+class Clock:
+    """Seconds of a run, compilation (tracing and loading from the cache included) apart.
+
+    Attributes:
+      load: reading and padding scenarios.
+      compile: making programs.
+      run: computing.
+    """
+
+    load: float = 0.0
+    compile: float = 0.0
+    run: float = 0.0
+
+    @contextmanager
+    def loading(self) -> Iterator[None]:
+        """Counts the time inside as loading."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.load += time.perf_counter() - started
+
+    @contextmanager
+    def computing(self) -> Iterator[None]:
+        """Counts the time inside as compiling, as far as JAX reports it, and else as running."""
+        from jax import monitoring
+
+        compiling = 0.0
+
+        def listen(event: str, seconds: float, **_: object) -> None:
+            nonlocal compiling
+            if event in _COMPILE_EVENTS:
+                compiling += seconds
+
+        monitoring.register_event_duration_secs_listener(listen)
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            monitoring.unregister_event_duration_listener(listen)
+            self.compile += compiling
+            self.run += max(0.0, time.perf_counter() - started - compiling)
+
+    def seconds(self) -> dict[str, float]:
+        """Returns the times as run.json holds them."""
+        return {
+            "load_s": round(self.load, 3),
+            "compile_s": round(self.compile, 3),
+            "run_s": round(self.run, 3),
+        }
+
+
+@contextmanager
+def stop_between_chunks() -> Iterator[Callable[[], bool]]:
+    """Turns the first Ctrl-C into a wish to stop; a second one interrupts at once.
+
+    Yields:
+      A function that says whether the user wants to stop.
+    """
+    asked = False
+
+    def ask(signum: int, frame: object) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        print("stopping after this chunk; Ctrl-C again stops at once", file=sys.stderr)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def provenance() -> dict[str, object]:
+    """Returns versions, the commit of the checkout (None outside one) and the device."""
+    import jax
+
+    device = jax.devices()[0]
+    return {
+        "versions": {name: importlib.metadata.version(name) for name in _VERSIONED},
+        "commit": commit(),
+        "device": f"{device.device_kind} ({device.platform})",
+    }
+
+
+def commit() -> str | None:
+    """Returns the commit this program was checked out at, "-dirty" appended where it was changed.
+
+    An installed package may lie in the working tree of another project: only a file that git
+    tracks counts.
+    """
+    here = Path(__file__)
+    git = ["git", "-C", str(here.parent)]
+    try:
+        tracked = subprocess.run(
+            [*git, "ls-files", "--error-unmatch", here.name], capture_output=True, check=False
+        )
+        if tracked.returncode:
+            return None
+        described = subprocess.run(
+            [*git, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    except OSError:  # no git on this machine
+        return None
+    return described.stdout.strip() or None

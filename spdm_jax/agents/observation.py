@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from spdm_jax.arrays import order_of, prefix_count, true_indices
 from spdm_jax.config import PlannerConfig
 from spdm_jax.geometry import Box, boxes_overlap, crosses_upward_ray, segment_meets_box
 from spdm_jax.types import Array, LightStatus, ObjectType, Polygons
@@ -76,7 +77,6 @@ def select_objects(
 
     Source: tuplan_garage `PDMObservation.update`.
     """
-    num = observation.x.shape[0]
     distance = jnp.hypot(observation.x - ego_x, observation.y - ego_y)
     present = observation.valid & ~excluded & (distance <= radius)
     group = jnp.where(
@@ -86,16 +86,19 @@ def select_objects(
     )
     # Group order is static, vehicle, pedestrian, bicycle = 0, 1, 2, 3; absent objects come last.
     group = jnp.where(present, group, 4)
-    order = jnp.lexsort((distance, group))
-    sorted_group = group[order]
-    starts = jnp.sum(group[:, None] < jnp.arange(5), axis=0)
-    rank = jnp.arange(num) - starts[sorted_group]
+    # Place within the own group, nearest first.
+    num = group.shape[0]
+    same = group[:, None] == group[None, :]
+    closer = distance[:, None] < distance[None, :]
+    earlier = jnp.arange(num)[:, None] < jnp.arange(num)[None, :]
+    tied = distance[:, None] == distance[None, :]
+    rank = jnp.sum(same & (closer | (tied & earlier)), axis=0)
     caps = jnp.asarray(
         [config.max_static, config.max_vehicles, config.max_pedestrians, config.max_bicycles, 0]
     )
-    keep = rank < caps[sorted_group]
-    kept = jnp.argsort(~keep, stable=True)[: min(num, config.max_objects)]
-    return SelectedObjects(track=order[kept].astype(jnp.int32), valid=keep[kept])
+    keep = rank < caps[group]
+    order = order_of(rank, group, ~keep)[: min(num, config.max_objects)]
+    return SelectedObjects(track=order, valid=keep[order])
 
 
 class RedLights(struct.PyTreeNode, kw_only=True):
@@ -141,12 +144,11 @@ def red_lights(
       max_edges: room for their edges.
     """
     red = (lights == LightStatus.RED) & lane_on_route
-    lane = jnp.nonzero(red, size=max_lights, fill_value=-1)[0].astype(jnp.int32)
-    valid = lane >= 0
-    slot_of_lane = jnp.where(red, jnp.cumsum(red) - 1, max_lights)
+    lane, valid = true_indices(red, max_lights)
+    lane = jnp.where(valid, lane, -1)
+    slot_of_lane = jnp.where(red, prefix_count(red) - 1, max_lights)
     use = polygons.valid & red[polygons.row] & (slot_of_lane[polygons.row] < max_lights)
-    index = jnp.nonzero(use, size=max_edges, fill_value=-1)[0]
-    edge_valid = index >= 0
+    index, edge_valid = true_indices(use, max_edges)
     a, b = polygons.xy[index], polygons.next_xy[index]
     slot = jnp.where(edge_valid, slot_of_lane[polygons.row[index]], max_lights).astype(jnp.int32)
     overflow = (jnp.sum(red) > max_lights) | (jnp.sum(use) > max_edges)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from spdm_jax.agents.observation import RedLights
+from spdm_jax.arrays import nth_true, prefix_count
 from spdm_jax.geometry import (
     Box,
     Path,
@@ -25,6 +26,8 @@ from spdm_jax.types import AgentForecast
 _JOIN_ANGLE = jnp.pi / 2 / 16
 BLOCK = 8
 """Segments in a run that is compared as one circle first."""
+BOXES = 128
+"""Boxes near a corridor that are looked at together."""
 PAIRS = 512
 """(run, box) pairs tested exactly at a time."""
 POINTS = 128
@@ -168,11 +171,6 @@ def _piece_meets_box(piece: _Segments, box: Box) -> jax.Array:
     return (hit | wedge) & piece.used
 
 
-def _gathered(pieces: _Segments, path: jax.Array, segment: jax.Array) -> _Segments:
-    """Picks pieces by path and segment index (both broadcast)."""
-    return jax.tree.map(lambda v: v[path, segment], pieces)
-
-
 class _Blocks(NamedTuple):
     """Circles around runs of segments, `[L, M / BLOCK]` each."""
 
@@ -199,7 +197,9 @@ def _blocks(axes: Corridor, pieces: _Segments, half_width: jax.Array) -> _Blocks
     return _Blocks(jnp.where(some, cx, 0), jnp.where(some, cy, 0), radius)
 
 
-def corridors_hit_boxes(axes: Corridor, half_width: jax.Array, box: Box) -> jax.Array:
+def corridors_hit_boxes(
+    axes: Corridor, half_width: jax.Array, box: Box, present: jax.Array
+) -> jax.Array:
     """Whether each corridor shares a point with each box.
 
     Runs of segments and boxes are first compared as circles; the few pairs that are close are
@@ -209,6 +209,7 @@ def corridors_hit_boxes(axes: Corridor, half_width: jax.Array, box: Box) -> jax.
       axes: `[L, M]` corridors.
       half_width: m.
       box: `[N]` boxes.
+      present: `[N]` bool, boxes that exist; the others hit nothing.
 
     Returns:
       `[L, N]` bool.
@@ -223,27 +224,40 @@ def corridors_hit_boxes(axes: Corridor, half_width: jax.Array, box: Box) -> jax.
     dy = blocks.y[..., None] - box.y
     limit = blocks.radius[..., None] + reach
     # A little slack: rounding must not lose a touching pair.
-    near = (dx * dx + dy * dy <= limit * limit * 1.0001) & (blocks.radius > 0)[..., None]
-    shape = near.shape  # [L, blocks, N]
-    order = jnp.cumsum(near.reshape(-1).astype(jnp.int32))
-    total = order[-1]
+    near = (dx * dx + dy * dy <= limit * limit * 1.0001) & present
+    near &= (blocks.radius > 0)[..., None]
+    # First the boxes that are near anything, then their (path, run) pairs.
+    boxes = prefix_count(jnp.any(near, axis=(0, 1)))
     lane = jnp.arange(BLOCK)
+    num_paths, num_blocks = near.shape[:2]
 
-    def some_pairs(carry):
+    def some_boxes(carry):
         chunk, hit = carry
-        wanted = chunk * PAIRS + jnp.arange(PAIRS, dtype=jnp.int32)
-        index = jnp.searchsorted(order, wanted + 1, method="scan")
-        index = jnp.minimum(index, order.shape[0] - 1)
-        path, block, row = jnp.unravel_index(index, shape)
-        piece = _gathered(pieces, path[:, None], block[:, None] * BLOCK + lane)
-        target = jax.tree.map(lambda v: jnp.broadcast_to(v, (num_boxes,))[row][:, None], box)
-        touch = jnp.any(_piece_meets_box(piece, target), axis=1) & (wanted < total)
-        where = jnp.where(touch, path * num_boxes + row, hit.shape[0])
-        return chunk + 1, hit.at[where].set(True, mode="drop")
+        number = chunk * BOXES + jnp.arange(BOXES, dtype=jnp.int32)
+        row = nth_true(boxes, number + 1)
+        close = near[:, :, row] & (number < boxes[-1])
+        pairs = prefix_count(close.reshape(-1))
 
-    start = (jnp.int32(0), jnp.zeros(shape[0] * num_boxes, bool))
-    _, hit = jax.lax.while_loop(lambda carry: carry[0] * PAIRS < total, some_pairs, start)
-    return hit.reshape(shape[0], num_boxes)
+        def some_pairs(carry):
+            part, hit = carry
+            wanted = part * PAIRS + jnp.arange(PAIRS, dtype=jnp.int32)
+            index = nth_true(pairs, wanted + 1)
+            path, block, column = jnp.unravel_index(index, (num_paths, num_blocks, BOXES))
+            segment = block[:, None] * BLOCK + lane
+            piece = jax.tree.map(lambda v: v[path[:, None], segment], pieces)
+            target = jax.tree.map(lambda v: v[row[column]][:, None], box)
+            touch = jnp.any(_piece_meets_box(piece, target), axis=1) & (wanted < pairs[-1])
+            where = jnp.where(touch, path * num_boxes + row[column], hit.shape[0])
+            return part + 1, hit.at[where].set(True, mode="drop")
+
+        _, hit = jax.lax.while_loop(
+            lambda carry: carry[0] * PAIRS < pairs[-1], some_pairs, (jnp.int32(0), hit)
+        )
+        return chunk + 1, hit
+
+    start = (jnp.int32(0), jnp.zeros(num_paths * num_boxes, bool))
+    _, hit = jax.lax.while_loop(lambda carry: carry[0] * BOXES < boxes[-1], some_boxes, start)
+    return hit.reshape(num_paths, num_boxes)
 
 
 def corridor_hits_lights(axis: Corridor, half_width: jax.Array, red: RedLights) -> jax.Array:
@@ -294,20 +308,19 @@ def project_where(paths: Path, px: jax.Array, py: jax.Array, wanted: jax.Array) 
       `[L, N]` arc lengths, 0 where not asked.
     """
     num = px.shape[0]
-    order = jnp.cumsum(wanted.reshape(-1).astype(jnp.int32))
-    total = order[-1]
+    flat = wanted.reshape(-1)
+    counts = prefix_count(flat)
 
     def some_points(carry):
         chunk, out = carry
-        rank = chunk * POINTS + jnp.arange(POINTS, dtype=jnp.int32)
-        index = jnp.searchsorted(order, rank + 1, method="scan")
-        index = jnp.minimum(index, order.shape[0] - 1)
+        number = chunk * POINTS + jnp.arange(POINTS, dtype=jnp.int32)
+        index = nth_true(counts, number + 1)
         path, row = index // num, index % num
         one = lambda p, x, y: project(jax.tree.map(lambda v: v[p], paths), x, y)
         progress = jax.vmap(one)(path, px[row], py[row])
-        where = jnp.where(rank < total, index, out.shape[0])
+        where = jnp.where(number < counts[-1], index, out.shape[0])
         return chunk + 1, out.at[where].set(progress, mode="drop")
 
-    start = (jnp.int32(0), jnp.zeros(order.shape[0], px.dtype))
-    _, out = jax.lax.while_loop(lambda carry: carry[0] * POINTS < total, some_points, start)
+    start = (jnp.int32(0), jnp.zeros(flat.shape, px.dtype))
+    _, out = jax.lax.while_loop(lambda carry: carry[0] * POINTS < counts[-1], some_points, start)
     return out.reshape(wanted.shape)

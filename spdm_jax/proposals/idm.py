@@ -134,7 +134,7 @@ def corridor_contents(
 
     flat = jax.tree.map(lambda v: v.reshape(-1), boxes)
     shape = (start.shape[0], *present.shape)
-    hit = corridors_hit_boxes(axes, half_width, flat).reshape(shape) & present
+    hit = corridors_hit_boxes(axes, half_width, flat, present.reshape(-1)).reshape(shape)
     progress = project_where(paths, flat.x, flat.y, hit.reshape(shape[0], -1)).reshape(shape)
 
     num_lights = red.valid.shape[0]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from spdm_jax.arrays import order_of, prefix_sum
 from spdm_jax.config import DT, SplineParams
 from spdm_jax.geometry import Path, interpolate, make_path, project, unwrap_masked, wrap
 from spdm_jax.proposals.lanes import sequence_path
@@ -108,7 +109,7 @@ def cubic_distance(
     clipped = jnp.mean(jnp.maximum(fine, 0), axis=1) * (end - begin)
     step = jnp.where(jnp.any(fine < 0, axis=1), clipped, step)
     held = jnp.diff(jnp.maximum(time - horizon, 0)) * jnp.maximum(target, 0)
-    return jnp.concatenate([jnp.zeros_like(time[:1]), jnp.cumsum(step + held)])
+    return jnp.concatenate([jnp.zeros_like(time[:1]), prefix_sum(step + held)])
 
 
 class _Candidates(NamedTuple):
@@ -214,7 +215,7 @@ def route_lane_paths(
     reach = found.at[branch] + distance[merge]
     fits = reach < found.path.length[branch]
     usable = found.usable[branch] & fits
-    rank = jnp.lexsort((branch, found.key[branch], merge, found.own[branch], ~usable))
+    rank = order_of(branch, found.key[branch], merge, found.own[branch], ~usable)
     chosen = rank[:num_paths]
     if chosen.shape[0] < num_paths:
         chosen = jnp.pad(chosen, (0, num_paths - chosen.shape[0]), constant_values=rank[-1])

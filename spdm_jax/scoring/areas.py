@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from spdm_jax.geometry import Box, box_corners
-from spdm_jax.types import PolygonGrid
+from spdm_jax.types import EgoState, PolygonGrid
 
 
 class AreaMasks(NamedTuple):
@@ -82,37 +82,41 @@ def containing_polygons(grid: PolygonGrid, x: jax.Array, y: jax.Array) -> tuple[
         word = polygon >> 5
         return tuple(v ^ jnp.where(word == w, bit, jnp.uint32(0)) for w, v in enumerate(words))
 
-    return jax.lax.fori_loop(0, grid.edges.shape[1], flip, tuple(words))
+    # Edges come first in their row, so the fullest cell that was hit bounds the work.
+    filled = jnp.sum(grid.edge_polygon >= 0, axis=1, dtype=jnp.int32)
+    return jax.lax.fori_loop(jnp.int32(0), jnp.max(filled[edge_row]), flip, tuple(words))
 
 
-def ego_areas(grid: PolygonGrid, masks: AreaMasks, box: Box) -> EgoAreas:
-    """Classifies ego boxes `[P, T]`.
+def ego_areas(
+    grid: PolygonGrid, masks: AreaMasks, ego: EgoState, box: Box
+) -> tuple[EgoAreas, jax.Array]:
+    """Classifies ego states `[P, T]` and their boxes.
 
-    Source: tuplan_garage `PDMScorer._calculate_ego_areas`. With c_j corners in polygon j: multiple
-    lanes = more than one j with c_j > 0 and none with c_j = 4; non-drivable = a corner in no
-    polygon; oncoming = centre in no on-route polygon (so off-road counts as oncoming too).
+    With c_j corners in polygon j: multiple lanes = more than one j with c_j > 0 and none with c_j =
+    4; non-drivable = a corner in no polygon; oncoming = centre in no on-route polygon (so off-road
+    counts as oncoming too).
+
+    Returns:
+      The flags, and whether the rear axle lies in an intersection, `[P, T]` bool.
+
+    Source: tuplan_garage `PDMScorer._calculate_ego_areas`.
     """
     cx, cy = box_corners(box)
-    x = jnp.concatenate([cx, box.x[..., None]], -1)
-    y = jnp.concatenate([cy, box.y[..., None]], -1)
+    # Corners, centre, rear axle; the long axes last, so that loops run along them.
+    x = jnp.concatenate([jnp.moveaxis(cx, -1, 0), box.x[None], ego.x[None]])
+    y = jnp.concatenate([jnp.moveaxis(cy, -1, 0), box.y[None], ego.y[None]])
     touched = jnp.zeros(box.x.shape, jnp.int32)
     whole = jnp.zeros(box.x.shape, bool)
     on_route = jnp.zeros(box.x.shape, bool)
-    corner_inside = jnp.zeros(cx.shape, bool)
+    crossing = jnp.zeros(box.x.shape, bool)
+    corner_inside = jnp.zeros((4, *box.x.shape), bool)
     for w, word in enumerate(containing_polygons(grid, x, y)):
-        word = word & masks.drivable[w]
-        corners = [word[..., c] for c in range(4)]
-        touched += jax.lax.population_count(
-            corners[0] | corners[1] | corners[2] | corners[3]
-        ).astype(jnp.int32)
-        whole |= (corners[0] & corners[1] & corners[2] & corners[3]) != 0
-        corner_inside |= word[..., :4] != 0
-        on_route |= (word[..., 4] & masks.on_route[w]) != 0
-    return EgoAreas((touched > 1) & ~whole, ~jnp.all(corner_inside, -1), ~on_route)
-
-
-def in_intersection(grid: PolygonGrid, masks: AreaMasks, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Whether points lie in an intersection area, `[...]` bool."""
-    words = containing_polygons(grid, x, y)
-    hits = [(word & masks.intersection[w]) != 0 for w, word in enumerate(words)]
-    return jnp.any(jnp.stack(hits), axis=0)
+        drivable = word & masks.drivable[w]
+        a, b, c, d = (drivable[i] for i in range(4))
+        touched += jax.lax.population_count(a | b | c | d).astype(jnp.int32)
+        whole |= (a & b & c & d) != 0
+        corner_inside |= drivable[:4] != 0
+        on_route |= (drivable[4] & masks.on_route[w]) != 0
+        crossing |= (word[5] & masks.intersection[w]) != 0
+    areas = EgoAreas((touched > 1) & ~whole, ~jnp.all(corner_inside, axis=0), ~on_route)
+    return areas, crossing

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from spdm_jax.arrays import true_indices
 from spdm_jax.config import DT, ScoringParams, VehicleParams
 from spdm_jax.geometry import Box, boxes_overlap, ego_box
 from spdm_jax.scoring.areas import EgoAreas
@@ -20,8 +21,9 @@ LOOK_AHEAD = (0, 3, 6, 9)
 """TTC steps ahead of each time index (0.0, 0.3, 0.6, 0.9 s)."""
 _NUM_AHEAD = len(LOOK_AHEAD)
 
-# From here on a loop over objects beats one broadcast over objects, time and proposals (CPU).
-_BROADCAST_LIMIT = 128
+# Up to here one object is compared with all times and proposals at once, from here on time by time
+# (measured on a CPU: the temporaries no longer fit its cache).
+_ALL_TIMES_LIMIT = 256
 
 
 class Contacts(NamedTuple):
@@ -78,48 +80,40 @@ def first_contacts(
     shift_x = jnp.stack([box.x + r * box.cos for r in reach])  # [F, T, P]
     shift_y = jnp.stack([box.y + r * box.sin for r in reach])
     objects, alive = _object_boxes(forecast, steps)
+    near = alive & _near_any(shift_x, shift_y, box, objects)  # [A, F, T]
+    num_objects = near.shape[0]
     never = jnp.int32(steps * _NUM_AHEAD)
+    index = jnp.arange(steps, dtype=jnp.int32)[:, None]
+    rows, _ = true_indices(jnp.any(near, axis=(1, 2)), num_objects)
+    count = jnp.sum(jnp.any(near, axis=(1, 2)), dtype=jnp.int32)
 
-    def hits(f, t, target: Box, can):
+    def meet(f, t, target: Box, can):
+        """Hits of one object at `LOOK_AHEAD[f]`: all times (slice) or one (index)."""
         here = Box(shift_x[f, t], shift_y[f, t], box.cos[t], box.sin[t], *box[4:])
         return boxes_overlap(here, target) & can
 
-    if num <= _BROADCAST_LIMIT:
-        every = slice(None)
-        first, key = None, None
-        index = jnp.arange(steps, dtype=jnp.int32)[:, None]
+    def all_times(target: Box, can):
+        first = jnp.full(num, steps, jnp.int32)
+        key = jnp.full(num, never, jnp.int32)
         for f in range(_NUM_AHEAD):
-            target = Box(
-                objects.x[:, f, :, None],
-                objects.y[:, f, :, None],
-                objects.cos[:, f, :, None],
-                objects.sin[:, f, :, None],
-                objects.half_length,
-                objects.half_width,
-            )
-            hit = hits(f, every, target, alive[:, f, :, None])  # [A, T, P]
+            at = jax.tree.map(lambda v, f=f: v[min(f, v.shape[0] - 1), :, None], target)
+            hit = meet(f, slice(None), at, can[f, :, None])
             if f == 0:
-                first = jnp.min(jnp.where(hit, index, jnp.int32(steps)), axis=1)
-            this = jnp.min(jnp.where(hit & moving, index * _NUM_AHEAD + f, never), axis=1)
-            key = this if key is None else jnp.minimum(key, this)
-        assert first is not None and key is not None
-        return Contacts(first.T, key.T)
+                first = jnp.min(jnp.where(hit, index, jnp.int32(steps)), axis=0)
+            this = jnp.min(jnp.where(hit & moving, index * _NUM_AHEAD + f, never), axis=0)
+            key = jnp.minimum(key, this)
+        return first, key
 
-    def one_object(args):
-        target, can = args
+    def time_by_time(target: Box, can):
+        times = jnp.any(can, axis=0)
+        begin = jnp.argmax(times).astype(jnp.int32)
+        end = steps - jnp.argmax(times[::-1]).astype(jnp.int32)
 
-        def at(t, carry):
+        def visit(t, carry):
             first, key = carry
             for f in range(_NUM_AHEAD):
-                here = Box(
-                    target.x[f, t],
-                    target.y[f, t],
-                    target.cos[f, t],
-                    target.sin[f, t],
-                    target.half_length[0, 0],
-                    target.half_width[0, 0],
-                )
-                hit = hits(f, t, here, can[f, t])
+                at = jax.tree.map(lambda v, f=f: v[min(f, v.shape[0] - 1), t % v.shape[1]], target)
+                hit = meet(f, t, at, can[f, t])
                 if f == 0:
                     first = jnp.where(hit, jnp.minimum(first, t), first)
                 when = t * _NUM_AHEAD + f
@@ -127,10 +121,38 @@ def first_contacts(
             return first, key
 
         start = (jnp.full(num, steps, jnp.int32), jnp.full(num, never, jnp.int32))
-        return jax.lax.fori_loop(jnp.int32(0), jnp.int32(steps), at, start)
+        return jax.lax.fori_loop(begin, end, visit, start)
 
-    first, key = jax.lax.map(one_object, (objects, alive))
+    one_object = all_times if num <= _ALL_TIMES_LIMIT else time_by_time
+
+    def visit_object(i, carry):
+        first, key = carry
+        row = rows[i]
+        target = jax.tree.map(lambda v: v[row], objects)
+        this_first, this_key = one_object(target, near[row])
+        return first.at[row].set(this_first), key.at[row].set(this_key)
+
+    start = (
+        jnp.full((num_objects, num), steps, jnp.int32),
+        jnp.full((num_objects, num), never, jnp.int32),
+    )
+    first, key = jax.lax.fori_loop(jnp.int32(0), count, visit_object, start)
     return Contacts(first.T, key.T)
+
+
+def _near_any(shift_x: jax.Array, shift_y: jax.Array, box: Box, objects: Box) -> jax.Array:
+    """Whether an object can touch any proposal at all, `[A, F, T]`: bounds against a circle."""
+    ego_reach = jnp.hypot(box.half_length, box.half_width)
+    # A little slack: rounding must not lose a touching pair.
+    reach = 1.001 * (ego_reach + jnp.hypot(objects.half_length, objects.half_width)) + 1e-3
+    low_x, high_x = jnp.min(shift_x, axis=2), jnp.max(shift_x, axis=2)
+    low_y, high_y = jnp.min(shift_y, axis=2), jnp.max(shift_y, axis=2)
+    return (
+        (objects.x >= low_x - reach)
+        & (objects.x <= high_x + reach)
+        & (objects.y >= low_y - reach)
+        & (objects.y <= high_y + reach)
+    )
 
 
 def _cos_to_object(ego_x, ego_y, ego_heading, x, y) -> jax.Array:

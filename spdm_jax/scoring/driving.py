@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from spdm_jax.arrays import prefix_sum
 from spdm_jax.config import ScoringParams
 from spdm_jax.geometry import Path, project
 
@@ -23,7 +24,7 @@ def driving_direction(
     """
     step = jnp.hypot(jnp.diff(center_x, axis=-1), jnp.diff(center_y, axis=-1))
     step = jnp.concatenate([jnp.zeros_like(step[..., :1]), step], axis=-1)
-    total = jnp.cumsum(jnp.where(oncoming, step, 0), axis=-1)
+    total = prefix_sum(jnp.where(oncoming, step, 0))
     before = jax.lax.cummax(jnp.where(oncoming, 0, total), axis=total.ndim - 1)
     longest = jnp.max(total - before, axis=-1)
     score = jnp.where(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from spdm_jax.config import DT, ScoringParams, VehicleParams
 from spdm_jax.geometry import Path, ego_box
 from spdm_jax.scoring.aggregate import aggregate
-from spdm_jax.scoring.areas import AreaMasks, ego_areas, in_intersection
+from spdm_jax.scoring.areas import AreaMasks, ego_areas
 from spdm_jax.scoring.collision import first_contacts, no_at_fault_collision, time_to_collision
 from spdm_jax.scoring.comfort import comfort_flags
 from spdm_jax.scoring.driving import driving_direction, progress
@@ -55,8 +55,7 @@ def score_trajectories(
     steps = ego.x.shape[1]
     box = ego_box(ego, vehicle)
     with jax.named_scope("areas"):
-        areas = ego_areas(world.grid, world.masks, box)
-        crossing = in_intersection(world.grid, world.masks, ego.x, ego.y)
+        areas, crossing = ego_areas(world.grid, world.masks, ego, box)
     with jax.named_scope("contacts"):
         contacts = first_contacts(ego, world.forecast, vehicle, params)
         collision = no_at_fault_collision(ego, areas, world.forecast, contacts, vehicle, params)

@@ -24,7 +24,7 @@ from spdm_jax.planner import (
 from spdm_jax.proposals import idm
 from spdm_jax.proposals.lanes import parallel_path
 from spdm_jax.scoring.aggregate import aggregate
-from spdm_jax.scoring.areas import EgoAreas, ego_areas
+from spdm_jax.scoring.areas import EgoAreas
 from spdm_jax.scoring.collision import first_contacts, no_at_fault_collision
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import reference_profiles, track
@@ -60,7 +60,7 @@ _score = jax.jit(score_trajectories)
 _decide = jax.jit(decide, static_argnames=("config",))
 _notice = jax.jit(notice, static_argnames=("config",))
 _select = jax.jit(select_objects, static_argnames=("config",))
-_areas = jax.jit(ego_areas)
+
 
 
 @jax.jit
