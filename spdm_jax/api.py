@@ -6,6 +6,7 @@ functions underneath are in `spdm_jax.functional`.
 
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -16,9 +17,18 @@ import numpy as np
 
 from spdm_jax import planner as planning
 from spdm_jax.agents.forecast import ForecastPoses
-from spdm_jax.config import PlannerConfig, PlannerParams, PlannerSpec, Tracker, spdm
+from spdm_jax.config import (
+    NUM_FORECAST,
+    PlannerConfig,
+    PlannerParams,
+    PlannerSpec,
+    Tracker,
+    spdm,
+)
+from spdm_jax.decision import cast_params
 from spdm_jax.geometry import ego_box
 from spdm_jax.io.build import build_scenario, start_at
+from spdm_jax.io.crop import MapIndex
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
 from spdm_jax.padding import PaddingConfig, batch, bucket, to_device
@@ -91,9 +101,13 @@ def from_raw(
       ScenarioError: nothing could be built.
     """
     pairs, failures = [], []
+    index: MapIndex | None = None
     for raw in scenarios:
         try:
-            pairs.append(build_scenario(raw))
+            # Scenarios of one log share its map: what is known of it is kept from one to the next.
+            if index is None or index.map is not raw.map:
+                index = MapIndex(raw.map)
+            pairs.append(build_scenario(raw, index=index))
         except ScenarioError as error:
             failures.append(Failure(raw.token, str(error)))
     return _collect(pairs, failures, padding, "the given scenarios")
@@ -153,8 +167,6 @@ def _precision(precision: Precision):
 
 def _fit_config(scenes: ScenarioSet, config: PlannerConfig) -> PlannerConfig:
     """Gives paths just the room that the longest lane sequence of the set needs."""
-    from dataclasses import replace
-
     route, count = scenes.batch.route, np.asarray(scenes.batch.map.lanes.centerline.count)
     needed = 2
     for sequences in (route.centerline_lanes, route.goal_lanes, route.branch_lanes):
@@ -173,7 +185,7 @@ def _forecast_poses(forecast, scenes: ScenarioSet, dtype) -> ForecastPoses | Non
         return None
     values = np.asarray(forecast, np.float64)
     tracks = scenes.batch.tracks.valid.shape[1]
-    expected = (len(scenes), tracks, planning.NUM_FORECAST, 3)
+    expected = (len(scenes), tracks, NUM_FORECAST, 3)
     if values.shape != expected:
         raise ValueError(
             f"forecast has shape {values.shape}, expected {expected}: x, y, heading (local frame) "
@@ -223,7 +235,7 @@ def plan(
     config = _fit_config(scenes, planner.config)
     with context:
         device = to_device(scenes.batch, dtype).replace(origin=jnp.zeros((len(scenes), 2), dtype))
-        params = planning.cast_params(planner.params, dtype)
+        params = cast_params(planner.params, dtype)
         poses = _forecast_poses(forecast, scenes, dtype)
         result = _to_numpy(_plan_batch(device, params, poses, config=config))
     return PlanSet(
@@ -260,7 +272,7 @@ def score_scene(
     Returns:
       `SubScores`, the driven `EgoState` `[P, 41]`, the `AgentForecast` and the overflow flag.
     """
-    params = planning.cast_params(params, scene.ego.x.dtype)
+    params = cast_params(params, scene.ego.x.dtype)
     state = planning.init(scene, params, config)
     given = planning.observe(scene, 0).replace(forecast=forecast)
     seen = planning.see(scene, given, state, params, config)
@@ -324,8 +336,6 @@ def score(
     Raises:
       ValueError: shapes, steps or interval do not fit, or a value is not finite.
     """
-    from dataclasses import replace
-
     config = config or PlannerConfig()
     if tracker not in ("reference", "corrected", "none"):
         raise ValueError(f"tracker is {tracker!r}; it must be 'reference', 'corrected' or 'none'")
@@ -355,7 +365,7 @@ def score(
         result = _score_batch(
             device,
             states,
-            planning.cast_params(params or PlannerParams(), dtype),
+            cast_params(params or PlannerParams(), dtype),
             _forecast_poses(forecast, scenes, dtype),
             config=config,
             tracker=not full and tracker != "none",

@@ -227,8 +227,8 @@ def interpolate(path: Path, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
     Source: tuplan_garage `PDMPath.interpolate`.
     """
     s = jnp.clip(s, jnp.minimum(jnp.asarray(1e-5, s.dtype), path.length), path.length)
-    # Few points: count; many: bisect.
-    method = "compare_all" if s.size < 128 else "scan_unrolled"
+    # Few points: count; many: bisect. (An unrolled bisection compiles for seconds.)
+    method = "compare_all" if s.size < 128 else "scan"
     index = jnp.searchsorted(path.progress, s, side="left", method=method)
     index = jnp.clip(index, 1, jnp.maximum(path.count - 1, 1))
     p0, p1 = path.progress[index - 1], path.progress[index]

@@ -156,7 +156,8 @@ class ScoreSet:
             names = [n for n, ok in zip(COMFORT_NAMES, flags, strict=True) if not ok]
             lost.append(f"uncomfortable: {', '.join(names)}")
             blame("comfort", None)
-        if at("progress") < 1:
+        # The best proposal's own ratio may be 1 less a rounding.
+        if at("progress") < 1 - 1e-6:
             lost.append(
                 f"progress {at('progress_raw'):.1f} m, {100 * at('progress'):.0f} % of the best "
                 "admissible proposal"

@@ -5,15 +5,29 @@ and lane 1 lies to its right. Test modules load this file by path (`load_helper`
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import shapely
 
+from spdm_jax import api, functional
+from spdm_jax.config import (
+    NUM_STATES,
+    PlannerConfig,
+    PlannerParams,
+    PlannerSpec,
+    pdm_closed,
+    spdm,
+)
 from spdm_jax.io.raw import RawArea, RawLane, RawMap, RawRoadblock, RawScenario, RawTracks
 from spdm_jax.padding import PaddingConfig
-from spdm_jax.types import LightStatus, ObjectType
+from spdm_jax.planner import PlannerState, PlanResult, StepInput
+from spdm_jax.types import EgoState, LightStatus, ObjectType, Scenario
 
 LANE_WIDTH = 3.5
 LIMIT = 13.4
@@ -24,17 +38,23 @@ FRONT = 4.049
 NUM_HISTORY, NUM_ITERATIONS, NUM_STEPS = 2, 20, 102
 
 PADDING = PaddingConfig(
-    lanes=(16, 32),
+    lanes=(16,),
     centerline_points=(2048,),
     left_boundary_points=(2048,),
     right_boundary_points=(2048,),
     lane_edges=(4096,),
     roadblocks=(16,),
-    grid_cells=(65536, 262144),
-    tracks=(16, 32),
+    grid_cells=(262144,),
+    grid_rows=(8192,),
+    grid_slots=(32,),
+    tracks=(16,),
     time=(128,),
 )
-"""One bucket for every scene of this module (rotated roads included), so that all share a compile."""
+"""One bucket for every scene of this module, so that all share one compiled program."""
+
+CONFIG = PlannerConfig(max_path_points=512)
+PDM = pdm_closed(15, config=CONFIG)
+SPDM = spdm(60, config=CONFIG)
 
 
 @dataclass(frozen=True)
@@ -199,6 +219,64 @@ def reordered(raw: RawScenario, seed: int) -> tuple[RawScenario, np.ndarray]:
     ), order
 
 
+def scene_of(raw: RawScenario, dtype=jnp.float64) -> Scenario:
+    """Returns one padded scene on the device."""
+    batch = functional.to_device(api.from_raw([raw], padding=PADDING).batch, dtype)
+    scene = jax.tree.map(lambda v: v[0], batch)
+    return scene.replace(origin=jnp.zeros(2, dtype))
+
+
+init = jax.jit(functional.init, static_argnames="config")
+observe = jax.jit(functional.observe)
+
+
+@partial(jax.jit, static_argnames="config")
+def advance(
+    scene: Scenario,
+    given: StepInput,
+    state: PlannerState,
+    params: PlannerParams,
+    config: PlannerConfig,
+) -> tuple[PlanResult, PlannerState, EgoState]:
+    """One step, and the ego 0.1 s later if it tracks the plan."""
+    result, following = functional.step(scene, given, state, params, config)
+    x, y, heading = (
+        getattr(result.trajectory, name)[None, :NUM_STATES] for name in ("x", "y", "heading")
+    )
+    states, _ = functional.track(x, y, heading, given.ego, params.vehicle, params.tracker)
+    return result, following, jax.tree.map(lambda v: v[0, 1], states)
+
+
+def plan(raw: RawScenario, planner: PlannerSpec) -> PlanResult:
+    """Plans once at iteration 0, in float64."""
+    scene = scene_of(raw)
+    state = init(scene, planner.params, config=planner.config)
+    result, _, _ = advance(scene, observe(scene, 0), state, planner.params, config=planner.config)
+    return jax.tree.map(np.asarray, result)
+
+
+def drive(
+    raw: RawScenario, planner: PlannerSpec, steps: int
+) -> tuple[np.ndarray, list[PlanResult]]:
+    """Closed loop in which the ego tracks its plan and the observation stays as at iteration 0.
+
+    Returns:
+      Ego poses `[steps + 1, 4]` x, y, heading, speed in map coordinates, and every plan.
+    """
+    scene = scene_of(raw)
+    origin = np.round(raw.ego[raw.num_history, :2])
+    state = init(scene, planner.params, config=planner.config)
+    given = observe(scene, 0)
+    poses, results = [], []
+    for _ in range(steps):
+        poses.append([float(getattr(given.ego, n)) for n in ("x", "y", "heading", "vx")])
+        result, state, ego = advance(scene, given, state, planner.params, config=planner.config)
+        results.append(result)
+        given = given.replace(ego=ego)
+    poses.append([float(getattr(given.ego, n)) for n in ("x", "y", "heading", "vx")])
+    return np.array(poses) + np.append(origin, [0, 0]), results
+
+
 def _strip(start: float, end: float, numbers: Sequence[int]) -> shapely.Polygon:
     top, bottom = 0.5 - min(numbers), -0.5 - max(numbers)
     return shapely.box(start, bottom * LANE_WIDTH, end, top * LANE_WIDTH)
@@ -234,7 +312,7 @@ def _add_block(raw_map, block, numbers, start, end, limit, intersection) -> None
 
 
 def _link(raw_map: RawMap, *chain: str) -> None:
-    for before, after in zip(chain, chain[1:], strict=False):
+    for before, after in itertools.pairwise(chain):
         a, b = raw_map.lanes[before], raw_map.lanes[after]
         a.successors, b.predecessors = (*a.successors, after), (*b.predecessors, before)
         first, second = raw_map.roadblocks[a.roadblock], raw_map.roadblocks[b.roadblock]

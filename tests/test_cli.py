@@ -1,4 +1,7 @@
-"""The `spdm` command: options, exit codes, error texts, and `pack` and `doctor` at work."""
+"""The `spdm` command: options, exit codes, error texts, and `pack` and `doctor` at work.
+
+`plan`, `score`, `show` and `demo` have their tests in test_runs.py.
+"""
 
 import os
 import subprocess
@@ -11,6 +14,7 @@ import pytest
 
 from spdm_experiments import cli, commands, doctor, sources
 from spdm_experiments.options import Pack
+from spdm_experiments.terminal import MAX_REASONS
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
 from spdm_jax.synthetic import SyntheticReader
@@ -175,13 +179,13 @@ def test_pack_writes_resumes_and_overwrites(tmp_path: Path, capsys: pytest.Captu
 def test_pack_lists_failed_scenarios(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    bad = [f"bad{i}" for i in range(commands.MAX_REASONS + 2)]
+    bad = [f"bad{i}" for i in range(MAX_REASONS + 2)]
     reader = BrokenReader(["open_road-0", *bad])
     monkeypatch.setattr(sources, "open_source", lambda options: (reader, ["half a remark"]))
     assert cli.main(["pack", "logs", str(tmp_path / "pack")]) == 1
     printed = capsys.readouterr()
     assert f"1 written, 0 there already, {len(bad)} failed" in printed.out
-    assert printed.out.count("field speed of bad") == commands.MAX_REASONS
+    assert printed.out.count("field speed of bad") == MAX_REASONS
     assert "2 more in" in printed.out
     assert "note: half a remark" in printed.err
     assert [path.name for path in tmp_path.glob("pack/*.npz")] == ["open_road-0.npz"]
@@ -280,6 +284,13 @@ def test_doctor_reports_wrong_numbers(
     monkeypatch.setattr(doctor, "_least_squares", lambda dtype: deviation)
     assert cli.main(["doctor"]) == 1
     assert "FAILED      least squares (float32)" in capsys.readouterr().out
+
+
+def test_doctor_notices_a_wrong_score(monkeypatch: pytest.MonkeyPatch):
+    moved = doctor.stored_trajectories()
+    moved[1, :, 1] += 2.0  # braking in the next lane scores otherwise than braking in the own
+    monkeypatch.setattr(doctor, "stored_trajectories", lambda: moved)
+    assert not doctor.run_checks()[-1].passed
 
 
 def test_doctor_without_cache(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

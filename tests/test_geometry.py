@@ -34,7 +34,7 @@ MAX_POINTS = 16
 
 _overlap, _distance = jax.jit(boxes_overlap), jax.jit(box_distance)
 _meets, _segment_distance = jax.jit(segment_meets_box), jax.jit(segment_box_distance)
-_project, _interpolate = jax.jit(project), jax.jit(interpolate)
+_project, _interpolate, _make_path = jax.jit(project), jax.jit(interpolate), jax.jit(make_path)
 
 
 def random_boxes(rng: np.random.Generator, num: int = PAIRS) -> np.ndarray:
@@ -128,9 +128,11 @@ def test_ray_parity_is_point_in_polygon(seed: int):
         triangle = shapely.Polygon([ring[0], a[i], b[i]])
         if triangle.area > 0:
             expected ^= shapely.contains_xy(triangle, points)
-    edges = shapely.linestrings(np.stack([np.repeat(ring[:1], len(ring), 0), a], 1))
-    rim = shapely.linestrings(np.stack([a, b], 1))
-    away = shapely.distance(shapely.points(points)[:, None], np.concatenate([edges, rim])) > 1e-9
+    edges: Any = shapely.linestrings(np.stack([np.repeat(ring[:1], len(ring), 0), a], 1))
+    rim: Any = shapely.linestrings(np.stack([a, b], 1))
+    lines: Any = np.concatenate([edges, rim])
+    where: Any = shapely.points(points)
+    away = shapely.distance(where[:, None], lines) > 1e-9
     clear = away.all(axis=1)
     np.testing.assert_array_equal(inside[clear], expected[clear])
 
@@ -162,7 +164,8 @@ def random_path(rng: np.random.Generator) -> tuple[np.ndarray, Path]:
     padded[:count, :2] = points
     padded[:count, 2] = np.arctan2(np.sin(turn), np.cos(turn))
     padded[count:] = rng.normal(size=(MAX_POINTS - count, 3))  # must not matter
-    path = make_path(*jnp.asarray(padded).T, jnp.asarray(count, jnp.int32))
+    x, y, heading = jnp.asarray(padded).T
+    path = make_path(x, y, heading, jnp.asarray(count, jnp.int32))
     return padded[:count], path
 
 
@@ -216,6 +219,20 @@ def test_float32_stays_float32():
     values = random_boxes(np.random.default_rng(0)).astype(np.float32)
     box = box_at(*(jnp.asarray(values[:, i]) for i in range(5)))
     assert _distance(box, box).dtype == jnp.float32
-    path = make_path(*jnp.zeros((3, 4), jnp.float32), jnp.asarray(2, jnp.int32))
+    zero = jnp.zeros(4, jnp.float32)
+    path = make_path(zero, zero, zero, jnp.asarray(2, jnp.int32))
     assert {v.dtype for v in _interpolate(path, jnp.ones(3, jnp.float32))} == {jnp.dtype("float32")}
     assert _project(path, *jnp.ones((2, 3), jnp.float32)).dtype == jnp.float32
+
+
+@given(seeds)
+def test_arc_length_never_decreases(seed: int):
+    rng = np.random.default_rng(seed)
+    chord = rng.uniform(0, 2, 1023) * (rng.random(1023) < 0.7)  # three in ten points repeat
+    x = np.concatenate([[0], np.cumsum(chord)])
+    for dtype, tolerance in ((jnp.float64, 1e-9), (jnp.float32, 2e-3)):
+        values = jnp.asarray(x, dtype), jnp.zeros(1024, dtype), jnp.zeros(1024, dtype)
+        path = _make_path(*values, jnp.asarray(1024, jnp.int32))
+        progress = np.asarray(path.progress)
+        assert np.all(np.diff(progress) >= 0)
+        np.testing.assert_allclose(progress, x, atol=tolerance)

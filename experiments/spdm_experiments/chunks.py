@@ -69,15 +69,19 @@ def scenario_files(source: Path, limit: int | None = None) -> list[Path]:
     return files[:limit]
 
 
-def survey(files: Sequence[Path]) -> Survey:
+def survey(files: Sequence[Path], allowed: PaddingConfig | None = None) -> Survey:
     """Reads every file once for its sizes.
+
+    Args:
+      files: scenario files.
+      allowed: bucket sizes; the defaults if None.
 
     Raises:
       ScenarioError: no file can be used, or two hold the same scenario.
     """
     paths, tokens, places, points, failures = [], [], [], [], []
     sources: set[str] = set()
-    buckets = {f.name: getattr(PaddingConfig(), f.name) for f in dataclasses.fields(PaddingConfig)}
+    buckets = dataclasses.asdict(allowed or PaddingConfig())
     common = dict.fromkeys(buckets, 0)
     for place, path in enumerate(files):
         try:

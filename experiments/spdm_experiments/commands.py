@@ -13,61 +13,34 @@ from spdm_experiments.options import Demo, Doctor, Pack, Plan, Score, Show
 if TYPE_CHECKING:
     from spdm_jax.io.pack import PackReport
 
-MAX_REASONS = 20
-"""Failed scenarios listed on the terminal; the report file has them all."""
-
 
 def doctor(options: Doctor) -> bool:
     """Prints versions, devices and the self-test; False if a check fails."""
-    from spdm_experiments.doctor import report
     from spdm_experiments.runtime import configure_jax
 
-    lines, passed = report(configure_jax(options, x64=True))
+    cache = configure_jax(options)
+    from spdm_experiments.doctor import report
+
+    lines, passed = report(cache)
     print("\n".join(lines))
     return passed
 
 
 def pack(options: Pack) -> bool:
     """Packs a source into scenario files; False if a scenario failed."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
     from spdm_experiments.sources import open_source
+    from spdm_experiments.terminal import progress_line
     from spdm_jax.io.pack import pack as pack_reader
-
-    class Rate(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.1f} scenarios/s")
 
     reader, notes = open_source(options)
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    with Progress(
-        TextColumn("packing"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        Rate(),
-        TextColumn("eta"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    ) as bar:
-        task = bar.add_task("packing", total=len(reader.tokens()))
-
-        def advance(done: int, total: int, token: str, outcome: str) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with progress_line("packing", len(reader.tokens())) as advance:
         report = pack_reader(
-            reader, options.destination, overwrite=options.overwrite, progress=advance
+            reader,
+            options.destination,
+            overwrite=options.overwrite,
+            progress=lambda done, total, token, outcome: advance(done),
         )
     print(summary(report, options.destination))
     return not report.failed
@@ -75,34 +48,51 @@ def pack(options: Pack) -> bool:
 
 def summary(report: "PackReport", destination: Path) -> str:
     """Returns the outcome of a pack in words, with the reason of each failed scenario."""
-    lines = [
+    from spdm_experiments.terminal import reasons
+    from spdm_jax.io.pack import REPORT_NAME
+
+    head = (
         f"{destination}: {report.total} scenarios, {len(report.written)} written, "
         f"{len(report.skipped)} there already, {len(report.failed)} failed"
-    ]
-    failed = list(report.failed.items())
-    lines += [f"  {token}: {reason}" for token, reason in failed[:MAX_REASONS]]
-    if len(failed) > MAX_REASONS:
-        from spdm_jax.io.pack import REPORT_NAME
-
-        lines.append(f"  {len(failed) - MAX_REASONS} more in {destination / REPORT_NAME}")
-    return "\n".join(lines)
+    )
+    return "\n".join([head, *reasons(report.failed, destination / REPORT_NAME)])
 
 
 def demo(options: Demo) -> bool:
-    """Plans and scores one built-in scene and writes a page that shows it."""
-    raise ValueError("spdm demo is not part of this version yet")
+    """Plans the built-in scenes with both planners; False if a scene failed."""
+    from spdm_experiments.runtime import configure_jax
+
+    configure_jax(options)
+    from spdm_experiments.demo import run_demo
+
+    return run_demo(options)
 
 
 def plan(options: Plan) -> bool:
-    """Plans once per scenario."""
-    raise ValueError("spdm plan is not part of this version yet")
+    """Plans once per scenario; False if a scenario failed."""
+    from spdm_experiments.runtime import configure_jax
+
+    configure_jax(options)
+    from spdm_experiments.runs import run_plan
+
+    return run_plan(options)
 
 
 def score(options: Score) -> bool:
-    """Scores given trajectories."""
-    raise ValueError("spdm score is not part of this version yet")
+    """Scores given trajectories; False if a scenario failed."""
+    from spdm_experiments.runtime import configure_jax
+
+    configure_jax(options)
+    from spdm_experiments.runs import run_score
+
+    return run_score(options)
 
 
 def show(options: Show) -> bool:
-    """Writes a page that draws one scenario."""
-    raise ValueError("spdm show is not part of this version yet")
+    """Draws one scenario; False if it failed."""
+    from spdm_experiments.runtime import configure_jax
+
+    configure_jax(options)
+    from spdm_experiments.runs import run_show
+
+    return run_show(options)

@@ -1,7 +1,8 @@
 """`spdm doctor`: what is installed, and does this machine compute what it should.
 
 A linear-algebra kernel that is silently wrong on one host shows up as scores of zero, hours later.
-The checks solve problems whose answers are known beforehand and take a few seconds.
+The checks solve problems whose answers are known beforehand. They take seconds, and half a minute
+where the program that scores the scene has to be compiled first.
 """
 
 import importlib.metadata
@@ -13,6 +14,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from spdm_jax import from_raw, score
+from spdm_jax.config import DT, NUM_STATES
+from spdm_jax.synthetic import make_scene
 
 PACKAGES = (
     "spdm-jax",
@@ -26,6 +31,29 @@ PACKAGES = (
     "pyyaml",
     "matplotlib",
 )
+
+SCENE = "parked_car"
+"""Scene that is scored; its numbers are below."""
+_SUB_SCORES = (
+    "total",
+    "no_at_fault_collision",
+    "drivable_area",
+    "driving_direction",
+    "time_to_collision",
+    "comfort",
+    "progress",
+    "progress_raw",
+)
+# Computed in float64 by the parity-tested scorer: into the parked car; braking behind it; past it
+# in the free lane; off the road to the right.
+_STORED = (
+    (0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 34.17699),
+    (0.779493, 1.0, 1.0, 1.0, 1.0, 1.0, 0.470783, 19.484659),
+    (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 41.387736),
+    (0.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 19.916329),
+)
+_SCENE_TOLERANCE = 2e-3
+"""Float32 moves the metres of progress by some 1e-5, a wrong rule moves a score by 0.08 or more."""
 
 
 @dataclass(frozen=True)
@@ -66,22 +94,22 @@ def version(name: str) -> str:
 
 
 def run_checks() -> list[Check]:
-    """Runs every self-test in float32 and, where 64-bit types are enabled, in float64."""
-    precisions = [np.float32, *([np.float64] if jax.config.values["jax_enable_x64"] else [])]
+    """Runs the numerical self-tests in float32 and float64, and scores the stored scene."""
     checks: list[Check] = []
-    for dtype in precisions:
-        # Room for another summation order and other sine kernels, not for a wrong result.
-        unit = float(np.finfo(dtype).eps)
-        tests: tuple[tuple[str, Callable[[type], float], float], ...] = (
-            ("least squares", _least_squares, 2e3 * unit),
-            ("angles", _angles, 20 * unit),
-            ("batched = one by one", _batching, 200 * unit),
-        )
-        checks += [
-            Check(f"{name} ({np.dtype(dtype).name})", test(dtype), tolerance)
-            for name, test, tolerance in tests
-        ]
-    return checks
+    with jax.enable_x64(True):
+        for dtype in (np.float32, np.float64):
+            # Room for another summation order and other sine kernels, not for a wrong result.
+            unit = float(np.finfo(dtype).eps)
+            tests: tuple[tuple[str, Callable[[type], float], float], ...] = (
+                ("least squares", _least_squares, 2e3 * unit),
+                ("angles", _angles, 20 * unit),
+                ("batched = one by one", _batching, 200 * unit),
+            )
+            checks += [
+                Check(f"{name} ({np.dtype(dtype).name})", test(dtype), tolerance)
+                for name, test, tolerance in tests
+            ]
+    return [*checks, Check("scored scene (float32)", _scored_scene(), _SCENE_TOLERANCE)]
 
 
 def _velocity_fit(positions: jax.Array) -> jax.Array:
@@ -124,3 +152,23 @@ def _batching(dtype: type) -> float:
     together = np.asarray(jax.jit(jax.vmap(_velocity_fit))(rows))
     alone = np.stack([np.asarray(single(row)) for row in rows])
     return float(np.max(np.abs(together - alone)) / np.max(np.abs(alone)))
+
+
+def stored_trajectories() -> np.ndarray:
+    """Returns the four trajectories `[4, 41, 3]` of the stored scores, in the ego's frame."""
+    # Speed m/s, acceleration m/s^2, sideways shift m.
+    motions = ((8.0, 0.0, 0.0), (8.0, -2.0, 0.0), (8.0, 1.0, 3.5), (6.0, -1.0, -6.0))
+    time = DT * np.arange(NUM_STATES)
+    share = time / time[-1]
+    poses = []
+    for speed, acceleration, shift in motions:
+        x = speed * time + acceleration / 2 * time**2
+        y = shift * (3 * share**2 - 2 * share**3)
+        poses.append(np.stack([x, y, np.arctan2(np.gradient(y), np.gradient(x))], axis=-1))
+    return np.stack(poses)
+
+
+def _scored_scene() -> float:
+    scores = score(from_raw([make_scene(SCENE)]), stored_trajectories()).scores
+    found = np.stack([np.asarray(getattr(scores, name))[0] for name in _SUB_SCORES], axis=-1)
+    return float(np.max(np.abs(found - np.array(_STORED))))

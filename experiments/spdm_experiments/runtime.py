@@ -1,11 +1,11 @@
-"""One run of a verb: device, precision, compile cache, clocks, Ctrl-C and provenance."""
+"""One run of a verb: device, compile cache, clocks, Ctrl-C and provenance."""
 
 import importlib.metadata
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +20,11 @@ _COMPILE_EVENTS = (
 _VERSIONED = ("spdm-jax", "jax", "jaxlib", "numpy", "shapely")
 
 
-def configure_jax(options: OnDevice, *, x64: bool) -> Path | None:
+def configure_jax(options: OnDevice) -> Path | None:
     """Applies the options to JAX; to be called before anything is computed.
 
     Args:
       options: device and compile cache.
-      x64: whether 64-bit types are available (arrays keep the type they are given).
 
     Returns:
       The folder of the compile cache, or None where there is none.
@@ -37,7 +36,6 @@ def configure_jax(options: OnDevice, *, x64: bool) -> Path | None:
 
     from spdm_jax.compile_cache import enable_compile_cache
 
-    jax.config.update("jax_enable_x64", x64)
     if options.device != "auto":
         jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[options.device])
     try:
@@ -80,10 +78,10 @@ class Clock:
 
         compiling = 0.0
 
-        def listen(event: str, seconds: float, **_: object) -> None:
+        def listen(event: str, duration_secs: float, **_: object) -> None:
             nonlocal compiling
             if event in _COMPILE_EVENTS:
-                compiling += seconds
+                compiling += duration_secs
 
         monitoring.register_event_duration_secs_listener(listen)
         started = time.perf_counter()
@@ -136,6 +134,20 @@ def provenance() -> dict[str, object]:
         "commit": commit(),
         "device": f"{device.device_kind} ({device.platform})",
     }
+
+
+def provenance_text(about: Mapping[str, object]) -> dict[str, str]:
+    """Returns what a page says of the run that it shows.
+
+    Args:
+      about: further entries; those that are no plain text or number are left out.
+    """
+    found = provenance()
+    versions = found.pop("versions")
+    assert isinstance(versions, dict)
+    plain = {key: value for key, value in about.items() if isinstance(value, str | int | float)}
+    entries = {**plain, **found, "version": versions["spdm-jax"], "jax": versions["jax"]}
+    return {key: str(value) for key, value in entries.items() if value is not None}
 
 
 def commit() -> str | None:

@@ -8,9 +8,10 @@ from shapely.geometry.base import BaseGeometry
 
 from spdm_jax.types import PolygonGrid
 
-CELL_SIZES = (1.0, 0.5, 0.25)
+CELL_SIZES = (1.0, 0.5)
 """Cell sizes to try, m; the first whose fullest cell holds few edges is taken."""
-MAX_EDGES_PER_CELL = 20
+# Where many lanes fork, their edges meet in one point and no cell size would part them.
+MAX_EDGES_PER_CELL = 40
 # An irrational shift keeps cell centres off the axis-aligned edges of drawn maps.
 _SHIFT = np.array([0.41421356, 0.73205081])
 # Cells are widened by this fraction when edges are collected, so that a point that rounding puts
@@ -109,7 +110,7 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
         )
         cells = np.arange(i0, i1)[:, None] * ny + np.arange(j0, j1)
         masks[cells[inside], bit // 32] |= np.uint32(1 << (bit % 32))
-    unique, cell_mask = np.unique(masks, axis=0, return_inverse=True)
+    unique, cell_mask = _unique_rows(masks)
 
     cell_edges = np.zeros(nx * ny, np.int32)
     cells, first, counts = np.unique(pairs[:, 0], return_index=True, return_counts=True)
@@ -132,6 +133,18 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
         edges=table,
         edge_polygon=owner,
     )
+
+
+def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`np.unique(rows, axis=0, return_inverse=True)` by hashing, in another order."""
+    factors = np.random.default_rng(0).integers(1, 2**63, rows.shape[1], np.uint64) | np.uint64(1)
+    with np.errstate(over="ignore"):
+        key = (rows.astype(np.uint64) * factors).sum(axis=1, dtype=np.uint64)
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first][inverse], rows):  # two rows with one hash
+        unique, inverse = np.unique(rows, axis=0, return_inverse=True)
+        return unique, inverse.reshape(-1)
+    return rows[first], inverse
 
 
 def _inside(columns: np.ndarray, rows: np.ndarray, edges: np.ndarray) -> np.ndarray:

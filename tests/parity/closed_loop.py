@@ -11,8 +11,8 @@ import shapely
 from spdm_jax.agents.forecast import constant_velocity
 from spdm_jax.agents.observation import Observation, select_objects
 from spdm_jax.config import NUM_STATES, PlannerConfig
+from spdm_jax.decision import decide, notice, target_speeds
 from spdm_jax.geometry import ego_box
-from spdm_jax.planner import decide, notice, target_speeds
 from spdm_jax.tracking.lqr import track
 
 from .pdm import observation_of, params_of
@@ -108,7 +108,7 @@ def replay(path: Path, report, dtype) -> None:
         best, theirs = int(decision.best), int(data["best_index"][i])
         gap = float(data["scores"][i].max() - data["scores"][i][best])
         if best != theirs and gap <= (1e-9 if f64 else 1e-4):
-            note = f"compared up to step {i}: a tie resolved otherwise ({best} for {theirs}, {gap:.1e})"
+            note = f"up to step {i}: a tie resolved otherwise ({best} for {theirs}, {gap:.1e})"
             break
         keep("loop scores", scores.total, data["scores"][i])
         multi = (scores.no_at_fault_collision, scores.drivable_area, scores.driving_direction)

@@ -10,17 +10,17 @@ import numpy as np
 from spdm_jax.agents.forecast import constant_velocity
 from spdm_jax.agents.observation import Observation, select_objects
 from spdm_jax.config import DT, PlannerConfig, PlannerParams, TrackerParams
-from spdm_jax.geometry import ego_box, interpolate
-from spdm_jax.planner import (
+from spdm_jax.decision import (
     Seen,
-    _extend_stage1,
-    _Stage1,
+    Stage1,
     brake_trajectory,
     cast_params,
     decide,
+    extend_stage1,
     notice,
     target_speeds,
 )
+from spdm_jax.geometry import ego_box, interpolate
 from spdm_jax.proposals import idm
 from spdm_jax.proposals.lanes import parallel_path
 from spdm_jax.scoring.aggregate import aggregate
@@ -62,13 +62,12 @@ _notice = jax.jit(notice, static_argnames=("config",))
 _select = jax.jit(select_objects, static_argnames=("config",))
 
 
-
 @jax.jit
 def _extend_all(paths, targets, rolled, pose, contents, seen, params):
     """8 s poses of every proposal."""
-    stage1 = _Stage1(*pose, rolled, contents)
+    stage1 = Stage1(*pose, rolled, contents)
     count = rolled.progress.shape[0] * rolled.progress.shape[1]
-    one = lambda i: _extend_stage1(paths, i, targets, stage1, seen, params)
+    one = lambda i: extend_stage1(paths, i, targets, stage1, seen, params)
     return jax.lax.map(one, jnp.arange(count))
 
 
@@ -148,7 +147,9 @@ def compare_scores(
         index = np.round(np.asarray(ours) / DT, 3)
         report.equal(name, f"{prefix}{key}_time_idx", index, data[f"{key}_time_idx"], robust)
     raw = np.asarray(scores.progress_raw)
-    report.close(name, f"{prefix}progress_raw", raw, data["progress_raw"], tolerance, whole)
+    # Near a bend's centre of curvature a projection multiplies rounding.
+    slack = 1 if f64 else 10
+    report.close(name, f"{prefix}progress_raw", raw, data["progress_raw"], tolerance * slack, whole)
     # Progress is normalised over the set: one flipped or tied row would move every score.
     same_rows = whole & (multi == data["multi_metrics"]).all(axis=0)
     same_rows &= np.asarray(scores.comfort) == weighted[2]
@@ -252,9 +253,11 @@ def check_scene(path: FilePath, report, dtype) -> None:
     )
     columns = world.columns
     hit = np.asarray(data["corridor_hit"])
-    report.equal(name, "corridor_hit", np.asarray(contents.hit)[..., columns], hit)
-    ours = np.asarray(contents.progress)[..., columns]
-    report.close(name, "corridor_progress", ours, data["corridor_progress"], state_tol * 10, hit)
+    ours = np.asarray(contents.hit)[..., columns]
+    report.equal(name, "corridor_hit", ours, hit)
+    at = np.asarray(contents.progress)[..., columns]
+    both = hit & ours
+    report.close(name, "corridor_progress", at, data["corridor_progress"], state_tol * 10, both)
     stored = stored_contents(data, world, dtype)
     rolled, pose = _rollout(
         world.paths,

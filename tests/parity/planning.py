@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spdm_jax import planner
+from spdm_jax import decision, planner
 from spdm_jax.config import pdm_closed
 from spdm_jax.geometry import box_corners, ego_box
 from spdm_jax.io.build import build_scenario, start_at
@@ -40,15 +40,15 @@ def _reader(root: Path, token: str) -> NuPlanReader:
 def _plan(scene, params, config):
     state = planner.init(scene, params, config)
     given = planner.observe(scene, 0)
-    params = planner.cast_params(params, scene.ego.x.dtype)
+    params = decision.cast_params(params, scene.ego.x.dtype)
     box = ego_box(given.ego, params.vehicle)
     lanes, parks = drivable_lanes(scene.map, box.x, box.y, params.map_radius)
     seen = planner.see(scene, given, state, params, config)
-    targets = planner.target_speeds(
+    targets = decision.target_speeds(
         scene.map.lanes.speed_limit[scene.route.start_lane[state.slot]], params
     )
-    stage1 = planner._stage1(state.paths, given.ego, targets, seen, params)
-    one = lambda i: planner._extend_stage1(state.paths, i, targets, stage1, seen, params)
+    stage1 = decision.stage1_proposals(state.paths, given.ego, targets, seen, params)
+    one = lambda i: decision.extend_stage1(state.paths, i, targets, stage1, seen, params)
     extended = jax.lax.map(one, jnp.arange(stage1.x.shape[0] * stage1.x.shape[1]))
     result, _ = planner.step(scene, given, state, params, config)
     return result, state, lanes, parks, seen, extended

@@ -1,5 +1,6 @@
 """Turns a stored reference scene into the structures that the library's stages take."""
 
+import itertools
 from dataclasses import dataclass
 
 import jax
@@ -39,7 +40,7 @@ def ragged(data, name: str) -> list[np.ndarray]:
     """Splits a concatenated array by its offsets."""
     offsets = data[f"{name}_offsets"]
     values = data[f"{name}_points" if name == "path" else f"{name}_xy"]
-    return [values[a:b] for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+    return [values[a:b] for a, b in itertools.pairwise(offsets)]
 
 
 def ego_state(array: np.ndarray, origin: np.ndarray, dtype) -> EgoState:

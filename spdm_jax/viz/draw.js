@@ -1,0 +1,303 @@
+"use strict";
+// Draws what `html.py` writes into #data: lengths in cm, angles in mrad, null where there is none.
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+const LAST = 40; // steps of 0.1 s
+const ink = data.colors;
+const car = data.vehicle;
+
+const state = {
+  scene: data.index,
+  planner: 0,
+  compare: false,
+  term: data.terms[0].key,
+  step: 0,
+  pinned: data.planners.map(() => null),
+  hover: null, // {planner, proposal}
+  view: { x: 0, y: 0, scale: 8 }, // centre in m, pixels per m
+  timer: null,
+};
+let panels = [];
+
+// ---- reading ------------------------------------------------------------------------------------
+
+const planOf = (planner) => data.planners[planner].scenes[state.scene];
+const pinnedOr = (planner) => state.pinned[planner] ?? planOf(planner).best;
+
+function shownProposal(planner) {
+  return state.hover && state.hover.planner === planner ? state.hover.proposal : pinnedOr(planner);
+}
+
+const pose = (flat, i) =>
+  flat[3 * i] === null || flat[3 * i] === undefined
+    ? null
+    : [flat[3 * i] / 100, flat[3 * i + 1] / 100, flat[3 * i + 2] / 1000];
+
+function mix(a, b, f) {
+  if (!a || !b) return f < 0.5 ? a : b;
+  const turn = Math.atan2(Math.sin(b[2] - a[2]), Math.cos(b[2] - a[2]));
+  return [a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * turn];
+}
+
+function egoCenter(rear) {
+  const [x, y, h] = rear;
+  return [x + car.reach * Math.cos(h), y + car.reach * Math.sin(h), h];
+}
+
+// The forecast has a sample every 0.2 s; in between the boxes move evenly.
+function objectPose(plan, scene, i, step) {
+  const future = plan.forecast[i];
+  if (!future) return step === 0 ? pose(scene.objects[i].pose, 0) : null;
+  const low = Math.floor(step / 2);
+  return step % 2 ? mix(pose(future, low), pose(future, low + 1), 0.5) : pose(future, low);
+}
+
+function color(score) {
+  if (score === null) return data.noScore;
+  const stops = data.scale;
+  const at = Math.min(Math.max(score, 0), 1) * (stops.length - 1);
+  const low = Math.min(Math.floor(at), stops.length - 2);
+  const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
+  const channel = (k) => {
+    const a = part(stops[low], k);
+    return Math.round(a + (at - low) * (part(stops[low + 1], k) - a));
+  };
+  return `rgb(${channel(0)},${channel(1)},${channel(2)})`;
+}
+
+const fixed = (value, digits) => (value === null ? "–" : value.toFixed(digits));
+
+// ---- paths, built once per scene ----------------------------------------------------------------
+
+function trace(path, flat, close) {
+  for (let i = 0; i < flat.length; i += 2) {
+    if (i) path.lineTo(flat[i] / 100, flat[i + 1] / 100);
+    else path.moveTo(flat[i] / 100, flat[i + 1] / 100);
+  }
+  if (close) path.closePath();
+  return path;
+}
+
+function mapPaths(scene) {
+  if (!scene.paths) {
+    scene.paths = {};
+    for (const [name, lines] of Object.entries(scene.map)) {
+      const path = new Path2D();
+      for (const line of lines) trace(path, line, data.areas.includes(name));
+      scene.paths[name] = path;
+    }
+  }
+  return scene.paths;
+}
+
+function proposalPaths(plan) {
+  if (!plan.paths) {
+    plan.paths = plan.states.map((flat) => {
+      const points = [];
+      for (let i = 0; i <= LAST; i += 1) {
+        const p = pose(flat, i);
+        if (p) points.push(p);
+      }
+      const path = new Path2D();
+      let length = 0;
+      points.forEach(([x, y], i) => {
+        if (!i) return path.moveTo(x, y);
+        length += Math.hypot(x - points[i - 1][0], y - points[i - 1][1]);
+        return path.lineTo(x, y);
+      });
+      return { path, points, length };
+    });
+    // Shorter ones on top: on a shared path each shows its own colour as far as it reaches alone.
+    plan.order = plan.paths.map((_, i) => i).sort((a, b) => plan.paths[b].length - plan.paths[a].length);
+  }
+  return plan.paths;
+}
+
+// ---- drawing ------------------------------------------------------------------------------------
+
+function box(ctx, [x, y, h], length, width) {
+  const c = Math.cos(h), s = Math.sin(h), a = length / 2, b = width / 2;
+  ctx.beginPath();
+  for (const [i, j] of [[a, b], [-a, b], [-a, -b], [a, -b]]) {
+    ctx.lineTo(x + i * c - j * s, y + i * s + j * c);
+  }
+  ctx.closePath();
+}
+
+function drawMap(ctx, scene, px) {
+  const paths = mapPaths(scene);
+  const fill = (path, style) => { ctx.fillStyle = style; ctx.fill(path, "evenodd"); };
+  const stroke = (path, style, width, dash = []) => {
+    ctx.strokeStyle = style;
+    ctx.lineWidth = width * px;
+    ctx.setLineDash(dash.map((d) => d * px));
+    ctx.stroke(path);
+  };
+  fill(paths.road, ink.road);
+  stroke(paths.road, ink.road_edge, 1);
+  fill(paths.route, ink.route);
+  fill(paths.crosswalks, ink.crosswalk);
+  stroke(paths.crosswalks, ink.road_edge, 1, [3, 3]);
+  stroke(paths.lane_edges, ink.lane, 1.4);
+  stroke(paths.centerlines, ink.centerline, 0.8, [5, 5]);
+  ctx.globalAlpha = 0.5;
+  stroke(paths.red, ink.red, 1.5);
+  ctx.globalAlpha = 1;
+  stroke(paths.stop_bars, ink.red, 4);
+  ctx.setLineDash([]);
+}
+
+function drawObjects(ctx, scene, plan, px) {
+  scene.objects.forEach((object, i) => {
+    const look = data.kinds[object.kind];
+    const future = plan.forecast[i];
+    if (future) {
+      ctx.beginPath();
+      for (let k = 0; k <= LAST / 2; k += 1) {
+        const p = pose(future, k);
+        if (p) ctx.lineTo(p[0], p[1]);
+      }
+      ctx.strokeStyle = look.color;
+      ctx.lineWidth = 1.2 * px;
+      ctx.stroke();
+    }
+    const here = objectPose(plan, scene, i, state.step);
+    const known = here || pose(object.pose, 0);
+    box(ctx, known, object.size[0] / 100, object.size[1] / 100);
+    ctx.globalAlpha = here ? 1 : 0.25;
+    ctx.fillStyle = look.color;
+    ctx.fill();
+    ctx.strokeStyle = ink.ink;
+    ctx.lineWidth = 0.9 * px;
+    ctx.setLineDash(plan.ignored[i] ? [2 * px, 2 * px] : []);
+    ctx.stroke();
+    ctx.setLineDash([]);
+    ctx.globalAlpha = 1;
+  });
+}
+
+function drawProposals(ctx, plan, shown, px) {
+  const lines = proposalPaths(plan);
+  const values = plan.scores[state.term];
+  ctx.lineCap = ctx.lineJoin = "round";
+  const one = (i, width, casing) => {
+    const { path, points } = lines[i];
+    const end = points[points.length - 1];
+    const dot = (radius, style) => {
+      if (!end) return;
+      ctx.fillStyle = style;
+      ctx.beginPath();
+      ctx.arc(end[0], end[1], radius * px, 0, 2 * Math.PI);
+      ctx.fill();
+    };
+    if (casing) {
+      ctx.strokeStyle = casing;
+      ctx.lineWidth = (width + 3) * px;
+      ctx.stroke(path);
+      dot(width + 2.7, casing);
+    }
+    ctx.strokeStyle = color(values[i]);
+    ctx.lineWidth = width * px;
+    ctx.stroke(path);
+    dot(width + 1.2, color(values[i]));
+  };
+  for (const i of plan.order) one(i, 1 + (values[i] ?? 0));
+  one(plan.best, 3, ink.ink);
+  if (shown !== plan.best) one(shown, 3.5, "#1f78d1");
+}
+
+function drawMoment(ctx, scene, moment, px) {
+  const outline = (p, length, width, dash, fill) => {
+    box(ctx, p, length, width);
+    if (fill) { ctx.fillStyle = fill; ctx.fill(); }
+    ctx.strokeStyle = ink.failure;
+    ctx.lineWidth = 2 * px;
+    ctx.setLineDash(dash.map((d) => d * px));
+    ctx.stroke();
+    ctx.setLineDash([]);
+  };
+  outline(pose(moment.ego, 0), car.length, car.width, [5, 3], "#ffffff60");
+  if (moment.ahead) outline(pose(moment.ahead, 0), car.length, car.width, [1.5, 3], null);
+  const there = moment.pose && pose(moment.pose, 0);
+  if (there) {
+    const object = scene.objects[moment.object];
+    const fill = `${data.kinds[object.kind].color}c0`;
+    outline(there, object.size[0] / 100, object.size[1] / 100, [5, 3], fill);
+  }
+}
+
+function drawLabel(ctx, view, w, h, moment, scene) {
+  const text = [moment.label];
+  if (moment.object >= 0) {
+    const object = scene.objects[moment.object];
+    text.push(`${data.kinds[object.kind].name} ${object.id}`);
+  }
+  const at = pose(moment.pose ?? moment.ego, 0);
+  const x = w / 2 + (at[0] - view.x) * view.scale;
+  const y = h / 2 - (at[1] - view.y) * view.scale;
+  ctx.font = "12.5px system-ui, sans-serif";
+  const width = Math.max(...text.map((t) => ctx.measureText(t).width)) + 14;
+  const height = 16 * text.length + 8;
+  // Away from the middle, where the proposals are, and always inside the picture.
+  const left = Math.min(Math.max(x < w / 2 ? x - width - 40 : x + 40, 6), w - width - 6);
+  const top = Math.min(Math.max(y < h / 2 ? y - height - 45 : y + 45, 6), h - height - 6);
+  ctx.strokeStyle = ink.failure;
+  ctx.lineWidth = 1.2;
+  ctx.beginPath();
+  ctx.moveTo(x, y);
+  ctx.lineTo(left + width / 2, top + height / 2);
+  ctx.stroke();
+  ctx.fillStyle = "#fff";
+  ctx.fillRect(left, top, width, height);
+  ctx.strokeRect(left, top, width, height);
+  ctx.fillStyle = ink.ink;
+  text.forEach((t, i) => ctx.fillText(t, left + 7, top + 17 + 16 * i));
+}
+
+function drawScaleBar(ctx, scale, h) {
+  const size = [5, 10, 20, 50, 100].find((m) => m * scale > 60) ?? 200;
+  ctx.fillStyle = ink.ink;
+  ctx.fillRect(14, h - 16, size * scale, 3);
+  ctx.font = "12px system-ui, sans-serif";
+  ctx.fillText(`${size} m`, 14, h - 21);
+}
+
+function draw(panel) {
+  const { canvas, planner } = panel;
+  const scene = data.scenes[state.scene], plan = planOf(planner), view = state.view;
+  const w = canvas.clientWidth, h = canvas.clientHeight, dpr = window.devicePixelRatio || 1;
+  if (!w || !h) return;
+  if (canvas.width !== Math.round(w * dpr)) canvas.width = Math.round(w * dpr);
+  if (canvas.height !== Math.round(h * dpr)) canvas.height = Math.round(h * dpr);
+  const ctx = canvas.getContext("2d"), k = dpr * view.scale, px = 1 / view.scale;
+  const shown = shownProposal(planner), moving = pinnedOr(planner);
+  ctx.setTransform(1, 0, 0, 1, 0, 0);
+  ctx.clearRect(0, 0, canvas.width, canvas.height);
+  ctx.setTransform(k, 0, 0, -k, (dpr * w) / 2 - k * view.x, (dpr * h) / 2 + k * view.y);
+  drawMap(ctx, scene, px);
+  drawObjects(ctx, scene, plan, px);
+  drawProposals(ctx, plan, shown, px);
+  const rear = pose(plan.states[moving], state.step);
+  if (rear) {
+    const center = egoCenter(rear), c = Math.cos(center[2]), s = Math.sin(center[2]);
+    box(ctx, center, car.length, car.width);
+    ctx.fillStyle = ink.ego;
+    ctx.fill();
+    ctx.strokeStyle = "#fff";
+    ctx.lineWidth = px;
+    ctx.stroke();
+    ctx.beginPath();
+    for (const [a, b] of [[0.4, 0], [0.1, 0.3], [0.1, -0.3]]) {
+      const i = a * car.length, j = b * car.width;
+      ctx.lineTo(center[0] + i * c - j * s, center[1] + i * s + j * c);
+    }
+    ctx.fillStyle = "#fff";
+    ctx.fill();
+  }
+  const moment = plan.moments[shown];
+  if (moment) drawMoment(ctx, scene, moment, px);
+  ctx.setTransform(dpr, 0, 0, dpr, 0, 0);
+  if (moment) drawLabel(ctx, view, w, h, moment, scene);
+  drawScaleBar(ctx, view.scale, h);
+}

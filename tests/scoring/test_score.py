@@ -1,0 +1,345 @@
+"""The scorer against a plain walk through time, and what must hold for any input."""
+
+import dataclasses
+import importlib.util
+from pathlib import Path as FilePath
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spdm_jax.config import ScoringParams, VehicleParams
+from spdm_jax.geometry import make_path
+from spdm_jax.io.grid import build_grid
+from spdm_jax.scoring.areas import AreaMasks, pack_bits
+from spdm_jax.scoring.collision import first_contacts
+from spdm_jax.scoring.score import World, score_trajectories
+from spdm_jax.types import AgentForecast, CollisionKind, EgoState, SubScores
+
+FIELDS = tuple(EgoState.__dataclass_fields__)
+VEHICLE, PARAMS = VehicleParams(), ScoringParams()
+NUM_OBJECTS, NUM_PROPOSALS = 6, 8
+seeds = st.integers(0, 2**32 - 1)
+
+
+def _load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, FilePath(__file__).with_name(f"{name}.py"))
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+plain = _load("plain_scorer")
+_score, _contacts = jax.jit(score_trajectories), jax.jit(first_contacts)
+
+# Two route lanes, an oncoming lane, a car park with a hole, and an intersection over the lanes.
+DRIVABLE = [
+    shapely.box(-40, -1.75, 60, 1.75),
+    shapely.box(-40, -5.25, 60, -1.75),
+    shapely.box(-40, 1.75, 60, 5.25),
+    shapely.box(5, -15, 25, -5.25).difference(shapely.box(12, -12, 16, -8)),
+]
+ON_ROUTE = np.array([True, True, False, False])
+INTERSECTIONS = [shapely.box(15, -6, 25, 6)]
+PATH = np.array([[-40.0, 0.0], [10.0, 0.5], [60.0, 0.0]])
+
+
+def grid_world(forecast: AgentForecast, dtype=jnp.float64) -> World:
+    grid = build_grid([*DRIVABLE, *INTERSECTIONS])
+    cast = lambda v: jnp.asarray(v, dtype if np.asarray(v).dtype.kind == "f" else None)
+    flags = lambda *rows: pack_bits(jnp.asarray(rows), 1)
+    masks = AreaMasks(
+        drivable=flags(True, True, True, True, False),
+        on_route=flags(*ON_ROUTE.tolist(), False),
+        intersection=flags(False, False, False, False, True),
+    )
+    x, y = jnp.asarray(PATH, dtype).T
+    line = make_path(x, y, jnp.zeros(3, dtype), jnp.asarray(3, jnp.int32))
+    return World(jax.tree.map(cast, grid), masks, forecast, line)
+
+
+def random_states(rng: np.random.Generator, num: int = NUM_PROPOSALS) -> np.ndarray:
+    """`[P, 41, 11]` unicycle motion, some standing or creeping, some with slip and noise."""
+    speed = np.maximum(
+        rng.uniform(0, 14, (num, 1)) + rng.uniform(-4, 3, (num, 1)) * 0.1 * np.arange(41), 0
+    )
+    speed[: num // 4] *= rng.choice([0, 0.0003, 0.004, 0.2], (num // 4, 1))
+    heading = rng.normal(0, 0.2, (num, 1)) + np.cumsum(
+        0.1 * rng.normal(0, 0.4, (num, 1)) + 0 * speed, 1
+    )
+    heading[num // 2 :: 4] += np.pi
+    heading = (heading + np.pi) % (2 * np.pi) - np.pi
+    states = np.zeros((num, 41, 11))
+    states[..., 0] = rng.uniform(-20, 15, (num, 1)) + np.cumsum(0.1 * speed * np.cos(heading), 1)
+    states[..., 1] = rng.uniform(-4.5, 3.5, (num, 1)) + np.cumsum(0.1 * speed * np.sin(heading), 1)
+    states[..., 2], states[..., 3] = heading, speed
+    states[..., 4] = rng.normal(0, 0.02, (num, 1)) * (rng.random((num, 1)) < 0.3)
+    states[..., 5] = np.gradient(speed, axis=1) / 0.1 + rng.normal(0, 0.3, (num, 41))
+    states[..., 6] = rng.normal(0, 0.5, (num, 1))
+    return states
+
+
+def random_objects(rng: np.random.Generator, states: np.ndarray, num: int = NUM_OBJECTS) -> dict:
+    """Objects that cross the trajectories: placed where some proposal is at some time."""
+    row, at = rng.integers(len(states), size=num), rng.integers(5, 41, num)
+    speed = rng.uniform(0, 8, num) * (rng.random(num) < 0.7)
+    heading = rng.uniform(-np.pi, np.pi, num)
+    time = 0.2 * (np.arange(41) - at[:, None] / 2)
+    agent = rng.random(num) < 0.7
+    speed *= agent
+    return {
+        "x": states[row, at, 0, None]
+        + rng.normal(0, 2, (num, 1))
+        + speed[:, None] * np.cos(heading)[:, None] * time,
+        "y": states[row, at, 1, None]
+        + rng.normal(0, 2, (num, 1))
+        + speed[:, None] * np.sin(heading)[:, None] * time,
+        "heading": np.broadcast_to(heading[:, None], (num, 41)).copy(),
+        "valid": rng.random((num, 41)) < rng.choice([1.0, 0.8], (num, 1)),
+        "length": rng.uniform(0.4, 6, num),
+        "width": rng.uniform(0.4, 2.5, num),
+        "agent": agent,
+        "speed": speed,
+        "present": rng.random(num) < 0.9,
+        "ignored": rng.random(num) < 0.1,
+    }
+
+
+def forecast_of(objects: dict, dtype=jnp.float64) -> AgentForecast:
+    number = lambda name: jnp.asarray(objects[name], dtype)
+    count = len(objects["agent"])
+    return AgentForecast(
+        x=number("x"),
+        y=number("y"),
+        heading=number("heading"),
+        sample_valid=jnp.asarray(objects["valid"]),
+        length=number("length"),
+        width=number("width"),
+        type=jnp.where(jnp.asarray(objects["agent"], bool), 0, 4).astype(jnp.int32),
+        is_agent=jnp.asarray(objects["agent"], bool),
+        speed=number("speed"),
+        current_heading=number("heading")[:, 0],
+        track=jnp.arange(count, dtype=jnp.int32),
+        valid=jnp.asarray(objects["present"], bool),
+        ignored=jnp.asarray(objects["ignored"] & objects["present"], bool),
+    )
+
+
+def state_of(array: np.ndarray, dtype=jnp.float64) -> EgoState:
+    return EgoState(**{name: jnp.asarray(array[..., i], dtype) for i, name in enumerate(FIELDS)})
+
+
+def score(states: np.ndarray, objects: dict, valid: np.ndarray | None = None) -> SubScores:
+    mask = jnp.ones(len(states), bool) if valid is None else jnp.asarray(valid)
+    result = _score(state_of(states), mask, grid_world(forecast_of(objects)), VEHICLE, PARAMS)
+    return jax.tree.map(np.asarray, result)
+
+
+def take(objects: dict, rows) -> dict:
+    return {name: values[rows] for name, values in objects.items()}
+
+
+@settings(max_examples=15)
+@given(seeds)
+def test_scorer_equals_a_plain_walk_through_time(seed: int):
+    rng = np.random.default_rng(seed)
+    states = random_states(rng)
+    objects = random_objects(rng, states)
+    ours = score(states, objects)
+    scorer = plain.PlainScorer(objects, DRIVABLE, ON_ROUTE, INTERSECTIONS, shapely.LineString(PATH))
+    rows = [scorer.score(row) for row in states]
+    for p, row in enumerate(rows):
+        areas = np.stack([ours.multiple_lanes, ours.non_drivable, ours.oncoming], -1)[p]
+        np.testing.assert_array_equal(areas, row["areas"])
+        for name in (
+            "no_at_fault_collision",
+            "time_to_collision",
+            "drivable_area",
+            "driving_direction",
+        ):
+            assert getattr(ours, name)[p] == row[name], (p, name)
+        np.testing.assert_array_equal(ours.comfort_flags[p], row["comfort_flags"])
+        assert ours.comfort[p] == row["comfort_flags"].all()
+        assert ours.collision_time[p] == pytest.approx(0.1 * row["collision_index"])
+        assert ours.ttc_time[p] == pytest.approx(0.1 * row["ttc_index"])
+        culprits = row["collision_objects"] or {-1}
+        assert int(ours.collision_object[p]) in culprits
+        assert int(ours.collision_kind[p]) in (row["collision_kinds"] or {-1})
+        assert int(ours.ttc_object[p]) in (row["ttc_objects"] or {-1})
+        assert ours.progress_raw[p] == pytest.approx(row["progress_raw"], abs=1e-9)
+    progress, total = plain.totals(rows)
+    np.testing.assert_allclose(ours.progress, progress, atol=1e-9)
+    np.testing.assert_allclose(ours.total, total, atol=1e-9)
+
+
+def test_random_worlds_exercise_every_rule():
+    seen: dict[str, set] = {}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        states = random_states(rng)
+        result = score(states, random_objects(rng, states))
+        for name in (
+            "no_at_fault_collision",
+            "time_to_collision",
+            "drivable_area",
+            "driving_direction",
+            "comfort",
+            "collision_kind",
+        ):
+            seen.setdefault(name, set()).update(getattr(result, name).tolist())
+    assert seen["no_at_fault_collision"] == {0.0, 0.5, 1.0}
+    assert seen["driving_direction"] == {0.0, 0.5, 1.0}
+    for name in ("time_to_collision", "drivable_area", "comfort"):
+        assert seen[name] == {0.0, 1.0}
+    # A stopped ego and a contact from behind are never at fault.
+    assert seen["collision_kind"] == {
+        -1,
+        CollisionKind.STOPPED_TRACK,
+        CollisionKind.ACTIVE_FRONT,
+        CollisionKind.ACTIVE_LATERAL,
+    }
+
+
+@pytest.mark.parametrize("copies", [8, 80])
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_few_and_many_proposals_score_bit_for_bit_alike(copies: int, dtype):
+    # 8 x 8 rows are compared at once, 80 x 8 in the arrangement for many proposals.
+    rng = np.random.default_rng(11)
+    states = random_states(rng)
+    forecast = forecast_of(random_objects(rng, states), dtype)
+    few = _contacts(state_of(states, dtype), forecast, VEHICLE, PARAMS)
+    many = _contacts(state_of(np.tile(states, (copies, 1, 1)), dtype), forecast, VEHICLE, PARAMS)
+    for one, all_ in zip(few, many, strict=True):
+        np.testing.assert_array_equal(np.tile(one, (copies, 1)), all_)
+    assert (np.asarray(few.time) < 41).any() and (np.asarray(few.ttc) < 164).any()
+
+
+@given(seeds)
+def test_scores_lie_in_their_ranges(seed: int):
+    rng = np.random.default_rng(seed)
+    states = random_states(rng)
+    result = score(states, random_objects(rng, states))
+    for name in ("total", "progress"):
+        values = getattr(result, name)
+        assert np.all((values >= 0) & (values <= 1))
+    assert set(result.no_at_fault_collision) <= {0.0, 0.5, 1.0}
+    assert set(result.driving_direction) <= {0.0, 0.5, 1.0}
+    for name in ("drivable_area", "time_to_collision", "comfort"):
+        assert set(getattr(result, name)) <= {0.0, 1.0}
+    assert np.all(result.progress_raw >= 0)
+    m = result.no_at_fault_collision * result.drivable_area * result.driving_direction
+    assert np.all(result.total <= m)
+    collided = result.no_at_fault_collision < 1
+    np.testing.assert_array_equal(np.isfinite(result.collision_time), collided)
+    np.testing.assert_array_equal(result.collision_object >= 0, collided)
+    np.testing.assert_array_equal(np.isfinite(result.ttc_time), result.time_to_collision < 1)
+
+
+@given(seeds, st.integers(0, NUM_OBJECTS - 1))
+def test_removing_an_object_never_lowers_a_safety_score(seed: int, row: int):
+    rng = np.random.default_rng(seed)
+    states = random_states(rng)
+    objects = random_objects(rng, states)
+    objects["present"][row] = True
+    fewer = dict(objects, present=objects["present"] & (np.arange(NUM_OBJECTS) != row))
+    before, after = score(states, objects), score(states, fewer)
+    assert np.all(after.no_at_fault_collision >= before.no_at_fault_collision)
+    assert np.all(after.time_to_collision >= before.time_to_collision)
+    assert np.all(after.collision_time >= before.collision_time)
+    for name in ("drivable_area", "driving_direction", "comfort", "progress_raw"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+@given(seeds)
+def test_order_of_objects_does_not_matter(seed: int):
+    rng = np.random.default_rng(seed)
+    states = random_states(rng)
+    objects = random_objects(rng, states)
+    order = rng.permutation(NUM_OBJECTS)
+    one, other = score(states, objects), score(states, take(objects, order))
+    for name in SubScores.__dataclass_fields__:
+        if name not in ("collision_object", "ttc_object", "collision_kind"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_order_of_proposals_does_not_matter():
+    rng = np.random.default_rng(5)
+    states = random_states(rng)
+    objects = random_objects(rng, states)
+    order = rng.permutation(NUM_PROPOSALS)
+    one, other = score(states, objects), score(states[order], objects)
+    for name in SubScores.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(one, name)[order], getattr(other, name))
+
+
+def same(one: SubScores, other: SubScores, rows: int) -> None:
+    for name in SubScores.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(one, name)[:rows], getattr(other, name)[:rows])
+
+
+def test_padding_changes_nothing():
+    rng = np.random.default_rng(21)
+    states = random_states(rng)
+    objects = random_objects(rng, states)
+    alone = score(states, objects)
+    # Objects that are not there, with boxes on top of the trajectories.
+    ghosts = dict(random_objects(rng, states, 10), present=np.zeros(10, bool))
+    more = {name: np.concatenate([objects[name], ghosts[name]]) for name in objects}
+    same(alone, score(states, more), NUM_PROPOSALS)
+    # Proposals that are not there: fast and far, so that they would win the normalisation.
+    extra = random_states(rng, 5)
+    extra[..., 0] += np.linspace(0, 500, 41)
+    valid = np.arange(NUM_PROPOSALS + 5) < NUM_PROPOSALS
+    wider = score(np.concatenate([states, extra]), objects, valid)
+    same(alone, wider, NUM_PROPOSALS)
+    np.testing.assert_array_equal(wider.total[NUM_PROPOSALS:], 0)
+    np.testing.assert_array_equal(wider.valid, valid)
+
+
+@pytest.mark.parametrize("num", [0, 3])
+def test_empty_worlds_are_scored(num: int):
+    """No row at all, or rows that hold no object."""
+    rng = np.random.default_rng(2)
+    states = random_states(rng)
+    objects = dict(random_objects(rng, states, num), present=np.zeros(num, bool))
+    result = score(states, objects)
+    np.testing.assert_array_equal(result.no_at_fault_collision, 1)
+    np.testing.assert_array_equal(result.time_to_collision, 1)
+    np.testing.assert_array_equal(result.collision_object, -1)
+    np.testing.assert_array_equal(result.ttc_object, -1)
+    assert np.all(np.isinf(result.collision_time)) and np.all(np.isinf(result.ttc_time))
+    assert result.total.max() > 0
+
+
+def test_nobody_moves():
+    """Without progress every admissible proposal gets the full progress term."""
+    states = np.zeros((2, 41, 11))
+    states[1, :, 1] = 30.0  # off the road
+    objects = random_objects(np.random.default_rng(0), states)
+    result = score(states, dict(objects, present=np.zeros(NUM_OBJECTS, bool)))
+    np.testing.assert_array_equal(result.progress, [1, 0])
+    np.testing.assert_array_equal(result.total, [1, 0])
+
+
+def test_weights_and_thresholds_are_used():
+    rng = np.random.default_rng(8)
+    states = random_states(rng)
+    world = grid_world(forecast_of(random_objects(rng, states)))
+    mask = jnp.ones(NUM_PROPOSALS, bool)
+    run = lambda **changes: _score(
+        state_of(states), mask, world, VEHICLE, dataclasses.replace(PARAMS, **changes)
+    )
+    usual = run()
+    m = usual.no_at_fault_collision * usual.drivable_area * usual.driving_direction
+    only_comfort = run(progress_weight=0.0, ttc_weight=0.0)
+    np.testing.assert_allclose(only_comfort.total, m * usual.comfort, atol=1e-12)
+    lenient = run(lon_accel_min=-1e3, lon_accel_max=1e3, lon_jerk_max=1e3, jerk_max=1e3)
+    assert np.all(np.asarray(lenient.comfort_flags)[:, [0, 2, 3]])
+    strict = run(lat_accel_max=1e-9)
+    assert not np.any(np.asarray(strict.comfort_flags)[:, 1])
