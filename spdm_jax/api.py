@@ -191,7 +191,7 @@ def _forecast_poses(forecast, scenes: ScenarioSet, dtype) -> ForecastPoses | Non
             f"forecast has shape {values.shape}, expected {expected}: x, y, heading (local frame) "
             "of every track of the batch at 0, 0.2, ... 8.0 s; NaN where it does not exist"
         )
-    valid = np.isfinite(values).all(-1)
+    valid = np.all(np.isfinite(values), axis=-1)
     clean = np.where(valid[..., None], values, 0.0)
     return ForecastPoses(
         *(jnp.asarray(clean[..., i], dtype) for i in range(3)), valid=jnp.asarray(valid)

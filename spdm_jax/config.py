@@ -7,13 +7,13 @@ Defaults are the published code's (tuplan_garage, nuPlan) and the paper's.
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
-import jax
 import numpy as np
 from flax import struct
 
-Scalar = float | jax.Array | np.ndarray
+Scalar: TypeAlias = Any
+"""A float, or an array where the field says so; traced inside `jit`."""
 
 Tracker = Literal["reference", "corrected"]
 ForecastMode = Literal["constant_velocity", "perfect", "none"]

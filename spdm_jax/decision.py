@@ -77,8 +77,8 @@ def notice(
         jnp.zeros(selected.valid.shape, bool),
         hide_agents=config.forecast == "none",
     )
-    now = [values[:, 0] for values in (forecast.x, forecast.y, forecast.heading)]
-    touching = forecast.valid & ego_contacts(box, *now, forecast.length, forecast.width)
+    x, y, heading = forecast.x[:, 0], forecast.y[:, 0], forecast.heading[:, 0]
+    touching = forecast.valid & ego_contacts(box, x, y, heading, forecast.length, forecast.width)
     inside = ego_inside(red, box)
     return Seen(
         forecast.replace(ignored=touching),

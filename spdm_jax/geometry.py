@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from spdm_jax.arrays import prefix_sum
 from spdm_jax.types import EgoState
@@ -159,7 +160,7 @@ def crosses_upward_ray(px, py, ax, ay, bx, by) -> jax.Array:
     return straddles & (px < ax + (py - ay) * (bx - ax) / dy)
 
 
-class Path(NamedTuple):
+class Path(struct.PyTreeNode):
     """A polyline with its arc length; padded points repeat beyond `count`.
 
     Attributes:

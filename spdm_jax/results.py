@@ -98,7 +98,8 @@ class ScoreSet:
     @property
     def status(self) -> list[str]:
         """Per scene: "ok", "overflow" (a buffer was too small) or "failed" (not finite)."""
-        finite = np.isfinite(np.where(self.scores.valid, self.scores.total, 0)).all(axis=1)
+        total = np.where(self.scores.valid, self.scores.total, 0)
+        finite = np.atleast_1d(np.all(np.isfinite(total), axis=1))
         over = np.zeros(len(self), bool) if self.overflow is None else self.overflow
         return [
             "overflow" if o else "ok" if f else "failed" for o, f in zip(over, finite, strict=True)

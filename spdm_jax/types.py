@@ -17,12 +17,13 @@ points, `V` flat polygon edges, `A` tracks, `T` time, `S` lanes in a sequence.
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any, TypeAlias
 
-import jax
-import numpy as np
 from flax import struct
 
-Array = jax.Array | np.ndarray
+Array: TypeAlias = Any
+"""A `numpy.ndarray` on the host, a `jax.Array` on the device: no type checker follows a pytree from
+one to the other, so fields are named for people and left open for the checker."""
 
 SCHEMA_VERSION = 1
 """Version of the scenario file layout; raised whenever a stored field changes its meaning."""

@@ -96,7 +96,7 @@ def road(
     ego_heading: float = 0.0,
     ego_lane: int = 1,
     blocks: Sequence[Sequence[int]] = ((0, 1), (0, 1)),
-    cuts: Sequence[float] = (200.0, 420.0),
+    cuts: Sequence[float] = (200.0, 460.0),
     things: Sequence[Thing] = (),
     limit: float | None = LIMIT,
     red: Sequence[int] = (),

@@ -207,6 +207,7 @@ def check_transforms(function: Any, batch: Any) -> None:
     assert_close(function(rows[0]), single[0])
 
 
+@pytest.mark.slow
 def test_scoring_under_every_transform():
     batch = stacked(RAW[:2])
     pose = trajectories()

@@ -53,13 +53,18 @@ def build_grid(polygons: Sequence[BaseGeometry], cell_size: float | None = None)
         return _pack(np.zeros(2), sizes[0], (1, 1), np.zeros((0, 2), int), edges, rows, polygons)
     low = np.minimum(edges[:, :2].min(0), edges[:, 2:].min(0))
     high = np.maximum(edges[:, :2].max(0), edges[:, 2:].max(0))
-    for size in sizes:
+
+    def cells(size):
         origin = np.floor(low) - (1 + _SHIFT) * size
         nx, ny = (np.ceil((high - origin) / size).astype(int) + 1).tolist()
-        pairs = _cells_of_edges(edges, origin, size, nx, ny)
-        if size == sizes[-1] or np.bincount(pairs[:, 0]).max() <= MAX_EDGES_PER_CELL:
-            break
-    return _pack(origin, size, (nx, ny), pairs, edges, rows, polygons)
+        return origin, size, (nx, ny), _cells_of_edges(edges, origin, size, nx, ny)
+
+    *coarse, finest = sizes
+    for size in coarse:
+        layout = cells(size)
+        if np.bincount(layout[-1][:, 0]).max() <= MAX_EDGES_PER_CELL:
+            return _pack(*layout, edges, rows, polygons)
+    return _pack(*cells(finest), edges, rows, polygons)
 
 
 def _cells_of_edges(edges, origin, size, nx, ny) -> np.ndarray:

@@ -205,7 +205,8 @@ def _check_area(polygon: BaseGeometry, name: str) -> None:
         raise ScenarioError(
             f"{name} is {polygon.wkt[:60]}; expected a non-empty Polygon or MultiPolygon"
         )
-    for ring in shapely.get_rings(polygon):
+    # Of a MultiPolygon as it is, shapely gives no rings.
+    for ring in shapely.get_rings(shapely.get_parts(polygon)):
         points = shapely.get_coordinates(ring)
         _expect_finite(points, name)
         _check_ring(points, name)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from spdm_jax.agents.observation import RedLights
 from spdm_jax.arrays import nth_true, prefix_count
@@ -34,7 +35,7 @@ POINTS = 128
 """Points projected at a time."""
 
 
-class Corridor(NamedTuple):
+class Corridor(struct.PyTreeNode):
     """Corridor of one path.
 
     Attributes:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from spdm_jax.agents.observation import RedLights, ego_inside
 from spdm_jax.config import DT, IDMParams, VehicleParams
@@ -184,7 +185,7 @@ def _search(forecast: AgentForecast, red: RedLights, contents: CorridorContents)
     )
 
 
-class _Found(NamedTuple):
+class _Found(struct.PyTreeNode):
     """Result of a leader search before the published quirks, `[...]` each."""
 
     index: jax.Array  # object or light, -1 free

@@ -65,7 +65,8 @@ _select = jax.jit(select_objects, static_argnames=("config",))
 @jax.jit
 def _extend_all(paths, targets, rolled, pose, contents, seen, params):
     """8 s poses of every proposal."""
-    stage1 = Stage1(*pose, rolled, contents)
+    x, y, heading = pose
+    stage1 = Stage1(x, y, heading, rolled, contents)
     count = rolled.progress.shape[0] * rolled.progress.shape[1]
     one = lambda i: extend_stage1(paths, i, targets, stage1, seen, params)
     return jax.lax.map(one, jnp.arange(count))
@@ -374,7 +375,7 @@ def check_scene(path: FilePath, report, dtype) -> None:
     ties = np.asarray(data["lead_tie"]).reshape(num_paths, num_policies, -1)
     tied = np.logical_or.accumulate(np.logical_or.accumulate(ties[..., :41], 2), 1)
     untied = ~tied.reshape(num, -1)
-    whole = untied.all(axis=1)
+    whole = np.atleast_1d(untied.all(axis=1))
     ours = np.stack([decision.proposals.x, decision.proposals.y, decision.proposals.heading], -1)
     pose_rows(ours, data["proposal_states"], "chain proposal", chain_tol, untied)
     _compare_states(

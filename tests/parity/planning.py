@@ -31,7 +31,7 @@ def _reader(root: Path, token: str) -> NuPlanReader:
     return NuPlanReader(
         root / "nuplan-v1.1",
         root / "maps",
-        ScenarioFilter(scenario_tokens=[token]),
+        ScenarioFilter(scenario_tokens=(token,)),
         window=Window(8.0, 0.0),
     )
 

@@ -64,7 +64,7 @@ def _lqr(name, d, report, dtype, tol):
     origin = d["reference_se2"][:, 0, :2]
     pose[0] = jnp.asarray(d["reference_se2"][..., 0] - origin[:, :1], dtype)
     pose[1] = jnp.asarray(d["reference_se2"][..., 1] - origin[:, 1:], dtype)
-    speed, curvature = reference_profiles(*pose, "reference")
+    speed, curvature = reference_profiles(pose[0], pose[1], pose[2], "reference")
     report.close(name, "velocity_profile", speed, d["velocity_profile"], tol)
     report.close(name, "curvature_profile", curvature, d["curvature_profile"], tol)
     # Accelerations and curvature rates are the fit's own unknowns: differences over 0.1 s.
@@ -79,7 +79,13 @@ def _lqr(name, d, report, dtype, tol):
     start = np.array(d["initial_states"])
     start[:, :2] -= origin
     states, commands = track(
-        *pose, ego_state(start, ZERO, dtype), params.vehicle, params.tracker, "reference"
+        pose[0],
+        pose[1],
+        pose[2],
+        ego_state(start, ZERO, dtype),
+        params.vehicle,
+        params.tracker,
+        "reference",
     )
     whole = state_array(states, ZERO)
     whole[..., :2] += origin[:, None]
@@ -93,7 +99,7 @@ def _lqr(name, d, report, dtype, tol):
     # One command at a later index, from the same initial state: shift the reference window.
     from spdm_jax.tracking import lqr
 
-    reference = lqr.reference_at(*pose, "reference")
+    reference = lqr.reference_at(pose[0], pose[1], pose[2], "reference")
     initial = ego_state(start, ZERO, dtype)
     for row, index in enumerate(np.asarray(d["iteration_index"]).astype(int)):
         at = jax.tree.map(lambda v, k=index: v[k], reference)
@@ -183,8 +189,8 @@ def _path(name, d, report, dtype, tol):
     f32 = report.precision == "f32"
     robust = np.asarray(d["query_gap"]) > (1e-3 if f32 else 1e-9)
     for row, (a, b) in enumerate(itertools.pairwise(offsets)):
-        columns = [jnp.asarray(pad(points[a:b, i], size), dtype) for i in range(3)]
-        path = make_path(*columns, jnp.asarray(b - a, jnp.int32))
+        x, y, heading = (jnp.asarray(pad(points[a:b, i], size), dtype) for i in range(3))
+        path = make_path(x, y, heading, jnp.asarray(b - a, jnp.int32))
         report.close(
             name, f"path_progress {row}", path.progress[: b - a], d["path_progress"][a:b], tol
         )

@@ -191,8 +191,8 @@ def paths_from(points: list[np.ndarray], origin, dtype) -> Path:
     rows = []
     for row in points:
         local = row - np.array([*origin, 0.0])
-        columns = [jnp.asarray(pad(local[:, c], size), dtype) for c in range(3)]
-        rows.append(make_path(*columns, jnp.asarray(len(row), jnp.int32)))
+        x, y, heading = (jnp.asarray(pad(local[:, c], size), dtype) for c in range(3))
+        rows.append(make_path(x, y, heading, jnp.asarray(len(row), jnp.int32)))
     return jax.tree.map(lambda *v: jnp.stack(v), *rows)
 
 

@@ -1,0 +1,50 @@
+"""Parity with stored reference runs: a handful of files here, all of them in the slow test."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+GOLDEN = ROOT.parent / "shared" / "golden"
+FEW = ("unit_comfort", "unit_path", "unit_lqr", "unit_driving_direction")
+
+
+def compare(folder: Path, precision: str) -> str:
+    """Runs the comparison as a user would; returns what it printed."""
+    command = [sys.executable, "-m", "tests.parity", "--golden", str(folder)]
+    run = subprocess.run(
+        [*command, "--precision", precision, "--brief"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert run.returncode in (0, 1), run.stderr[-2000:]
+    assert run.returncode == 0, run.stdout[-3000:]
+    return run.stdout
+
+
+@pytest.fixture
+def golden() -> Path:
+    if not GOLDEN.is_dir():
+        pytest.skip("reference data not at hand")
+    return GOLDEN / "pdm"
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_units(golden: Path, tmp_path: Path, precision: str):
+    for name in FEW:
+        (tmp_path / f"{name}.npz").symlink_to(golden / f"{name}.npz")
+    assert "0 failed" in compare(tmp_path, precision)
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_a_scene(golden: Path, tmp_path: Path, precision: str):
+    scene = sorted(path.name for path in golden.glob("scorer_*.npz"))[0].removeprefix("scorer_")
+    for kind in ("scene", "scorer"):
+        (tmp_path / f"{kind}_{scene}").symlink_to(golden / f"{kind}_{scene}")
+    assert "0 failed" in compare(tmp_path, precision)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_everything(golden: Path, precision: str):
+    assert "0 failed" in compare(golden.parent, precision)
