@@ -115,6 +115,7 @@ def test_plan_table_has_one_row_per_real_proposal(plans: PlanSet):
     np.testing.assert_array_equal(table["total"].to_numpy(), plans.scores.total.reshape(-1))
 
 
+@pytest.mark.slow
 def test_planned_proposals_score_the_same_alone(scenes: ScenarioSet, plans: PlanSet):
     """Reference poses scored from outside, in the frame they come in, by the same rules."""
     pose = [np.asarray(getattr(plans.plans.proposals, n), float) for n in ("x", "y", "heading")]
@@ -179,6 +180,10 @@ def test_trackers(scenes: ScenarioSet):
     np.testing.assert_allclose(none.tracked.vx[0, :, 1:], speeds[:, None] + np.zeros(40), atol=1e-9)
     np.testing.assert_allclose(reference.tracked.vx[:, :, 0], 10.0)
     assert np.abs(reference.tracked.x[0] - none.tracked.x[0]).max() > 0.5
+
+
+@pytest.mark.slow
+def test_corrected_tracker_differs(scenes: ScenarioSet):
     # A start with a growing acceleration, which the published fit does not follow exactly.
     start = straight(np.linspace(0, 14, NUM))
     start[..., 0] += 0.1 * STEPS**3
