@@ -13,8 +13,9 @@ import jax.numpy as jnp  # noqa: E402
 
 from spdm_jax.compile_cache import enable_compile_cache  # noqa: E402
 
+from .closed_loop import replay  # noqa: E402
 from .loader import check_loader_golden  # noqa: E402
-from .pdm import check_closed_loop, check_scene, check_scorer  # noqa: E402
+from .pdm import check_scene, check_scorer  # noqa: E402
 from .planning import check_planning  # noqa: E402
 from .report import Report  # noqa: E402
 from .units import check_unit  # noqa: E402
@@ -51,7 +52,7 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
     by_prefix = {
         "scene_": check_scene,
         "scorer_": check_scorer,
-        "closedloop_": check_closed_loop,
+        "closedloop_": replay,
         "pdm_": check_planning,
     }
     for path in sorted(folder.rglob("*")):

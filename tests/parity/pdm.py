@@ -9,7 +9,7 @@ import numpy as np
 
 from spdm_jax.agents.forecast import constant_velocity
 from spdm_jax.agents.observation import Observation, select_objects
-from spdm_jax.config import DT, PlannerConfig, PlannerParams, TrackerParams
+from spdm_jax.config import DT, PlannerConfig, PlannerParams
 from spdm_jax.decision import (
     Seen,
     Stage1,
@@ -475,13 +475,3 @@ def check_scorer(path: FilePath, report, dtype) -> None:
         robust_areas=robust_areas,
         tolerance=tolerance,
     )
-
-
-def check_closed_loop(path: FilePath, report, dtype) -> None:
-    """Replays consecutive steps with the planner's memory and perfect ego simulation."""
-    from .closed_loop import replay
-
-    replay(path, report, dtype)
-
-
-__all__ = ["TrackerParams", "check_closed_loop", "check_scene", "check_scorer"]

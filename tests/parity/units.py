@@ -35,6 +35,7 @@ from spdm_jax.scoring.collision import (
 )
 from spdm_jax.scoring.comfort import comfort_flags, comfort_signals
 from spdm_jax.scoring.driving import driving_direction
+from spdm_jax.tracking import lqr
 from spdm_jax.tracking.lqr import bicycle_step, reference_profiles, track
 from spdm_jax.types import AgentForecast, EgoState
 
@@ -97,8 +98,6 @@ def _lqr(name, d, report, dtype, tol):
     report.close(name, "rollout_states", wrapped * weight, np.zeros_like(wrapped), tol * 10)
     report.close(name, "rollout_commands", commands, d["rollout_commands"], tol * 10)
     # One command at a later index, from the same initial state: shift the reference window.
-    from spdm_jax.tracking import lqr
-
     reference = lqr.reference_at(pose[0], pose[1], pose[2], "reference")
     initial = ego_state(start, ZERO, dtype)
     for row, index in enumerate(np.asarray(d["iteration_index"]).astype(int)):
