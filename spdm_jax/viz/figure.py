@@ -241,7 +241,7 @@ def _draw_proposals(ax: Axes, view: PlanView, color_by: str) -> None:
     from matplotlib.patheffects import withStroke
 
     scale = LinearSegmentedColormap.from_list("score", list(SCORE_COLORS))
-    scale.set_bad(NO_SCORE_COLOR)
+    scale = scale.with_extremes(bad=NO_SCORE_COLOR)
     values = np.ma.masked_invalid(view.scores[color_by])
     colors = scale(values)
     xy = view.states[..., :2]

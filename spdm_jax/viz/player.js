@@ -309,7 +309,11 @@ const rows = document.querySelector("#rows tbody");
 const rowAt = (event) => event.target.closest("tr");
 rows.addEventListener("pointerover", (e) => hoverAt(state.planner, Number(rowAt(e).dataset.proposal)));
 rows.addEventListener("pointerleave", () => hoverAt(state.planner, null));
-rows.addEventListener("click", (e) => pin(state.planner, Number(rowAt(e).dataset.proposal)));
+rows.addEventListener("click", (e) => {
+  const proposal = Number(rowAt(e).dataset.proposal);
+  hoverAt(state.planner, proposal);  // a tap comes without a pointer over the row before
+  pin(state.planner, proposal);
+});
 rows.addEventListener("keydown", (e) => {
   if (e.key === "Enter") pin(state.planner, Number(rowAt(e).dataset.proposal));
 });
@@ -333,7 +337,8 @@ $("fit").addEventListener("click", () => { fitView(); redraw(); });
 $("time").addEventListener("input", (e) => { play(false); setStep(Number(e.target.value)); });
 $("mark").addEventListener("click", () => {
   play(false);
-  setStep(planOf(state.planner).moments[shownProposal(state.planner)].step);
+  const moment = planOf(state.planner).moments[shownProposal(state.planner)];
+  if (moment) setStep(moment.step);
 });
 $("play").addEventListener("click", () => play(state.timer === null));
 document.addEventListener("keydown", (event) => {

@@ -29,7 +29,7 @@ def center_of(collection) -> np.ndarray:
     return collection.get_paths()[0].vertices[:4].mean(axis=0)
 
 
-@pytest.mark.parametrize("index, kind", enumerate(scene_names()))
+@pytest.mark.parametrize("index, kind", list(enumerate(scene_names())))
 def test_every_scene_shows_map_objects_and_proposals(
     scenes: ScenarioSet, plans: PlanSet, index: int, kind: str
 ):
@@ -157,7 +157,9 @@ def test_axes_of_the_caller_are_used_and_pyplot_is_left_alone(scenes: ScenarioSe
 @pytest.mark.parametrize("form, start", [("svg", b"<?xml"), ("pdf", b"%PDF"), ("png", b"\x89PNG")])
 def test_files_for_print(scenes: ScenarioSet, plans: PlanSet, form: str, start: bytes):
     file = BytesIO()
-    plot_scene(scenes, plans, scene_names().index("red_light")).figure.savefig(file, format=form)
+    figure = plot_scene(scenes, plans, scene_names().index("red_light")).get_figure(root=True)
+    assert figure is not None
+    figure.savefig(file, format=form)
     content = file.getvalue()
     assert content.startswith(start) and len(content) > 10_000
     if form == "svg":

@@ -186,7 +186,7 @@ def test_show_displays_inline_in_notebooks(
     assert source and html.unescape(source[1]) == render(scenes, plans, index=2)
 
 
-# ---- in a browser ---------------------------------------------------------------------------------
+# ---- in a browser ------------------------------------------------------------------------------
 
 ACTIONS = """<script>
 const told = [];
@@ -214,7 +214,7 @@ panel.canvas.dispatchEvent(new PointerEvent("pointermove", spot));
 report.hover = state.hover;
 panel.canvas.dispatchEvent(new PointerEvent("pointerdown", spot));
 panel.canvas.dispatchEvent(new PointerEvent("pointerup", spot));
-report.pinned = state.pinned;
+report.pinned = [...state.pinned];
 report.focus = state.planner;
 const before = { ...state.view };
 panel.canvas.dispatchEvent(new WheelEvent("wheel", { ...spot, deltaY: -200 }));
@@ -225,7 +225,7 @@ panel.canvas.dispatchEvent(new PointerEvent("pointerdown", spot));
 panel.canvas.dispatchEvent(new PointerEvent("pointermove", drag(50)));
 panel.canvas.dispatchEvent(new PointerEvent("pointerup", drag(50)));
 report.pan = (x - state.view.x) * state.view.scale;
-report.stillPinned = state.pinned;
+report.stillPinned = [...state.pinned];
 const failing = rowsNow().find((row) => planOf(1).moments[Number(row.dataset.proposal)]);
 failing.click();
 report.why = [...document.querySelectorAll("#why li")].map((item) => item.textContent);
