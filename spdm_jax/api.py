@@ -165,7 +165,7 @@ def _precision(precision: Precision):
     raise ValueError(f"precision is {precision!r}; it must be 'f32' or 'f64'")
 
 
-def _fit_config(scenes: ScenarioSet, config: PlannerConfig) -> PlannerConfig:
+def fit_config(scenes: ScenarioSet, config: PlannerConfig) -> PlannerConfig:
     """Gives paths just the room that the longest lane sequence of the set needs."""
     route, count = scenes.batch.route, np.asarray(scenes.batch.map.lanes.centerline.count)
     needed = 2
@@ -232,7 +232,7 @@ def plan(
     """
     planner = planner or spdm()
     dtype, context = _precision(precision)
-    config = _fit_config(scenes, planner.config)
+    config = fit_config(scenes, planner.config)
     with context:
         device = to_device(scenes.batch, dtype).replace(origin=jnp.zeros((len(scenes), 2), dtype))
         params = cast_params(planner.params, dtype)
@@ -341,7 +341,7 @@ def score(
         raise ValueError(f"tracker is {tracker!r}; it must be 'reference', 'corrected' or 'none'")
     if tracker != "none":
         config = replace(config, tracker=tracker)
-    config = _fit_config(scenes, config)
+    config = fit_config(scenes, config)
     values = check_trajectories(as_array(trajectories), dt, len(scenes))
     now = np.asarray(scenes.batch.num_history)
     row = np.arange(len(scenes))

@@ -133,9 +133,9 @@ def test_chunks_are_of_one_shape_and_hold_every_scene_once(size: int, found: Sur
 
 
 def test_longest_route_decides_the_path_buffer(found: Survey):
-    from spdm_jax.api import _fit_config
+    from spdm_jax.api import fit_config
 
-    room = lambda scenes: _fit_config(scenes, pdm_closed().config).max_path_points
+    room = lambda scenes: fit_config(scenes, pdm_closed().config).max_path_points
     whole = room(load(found.paths, padding=found.padding))
     alone = [room(load(path, padding=found.padding)) for path in found.paths]
     assert alone[found.longest] == whole == max(alone)

@@ -1,0 +1,247 @@
+"""`python -m spdm_experiments.bench`: times planning and scoring next to a NumPy yardstick.
+
+One child process per (cores, precision), pinned before JAX is imported. Within a child the NumPy
+yardstick (one 1,024 x 1,024 float32 matrix product) is timed between the repetitions, so that
+figures can be compared between machines and hours. The first call (compilation) is reported apart.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+QUOTED = {
+    "PDM-Closed 15": "200-265 ms",
+    "PDM-Closed 30": "220-275 ms",
+    "PDM-Closed 60": "400-440 ms",
+    "SPDM 60": "400-440 ms (PDM-Closed grid of 60)",
+    "track + score 4096": "24 s",
+}
+"""The published reference on one thread of this class of machine, when the yardstick took 29 ms:
+quoted, not measured here."""
+SCENE = ("platoon", 3)
+"""Generated scene and seed that the single-scene rows use."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much to run."""
+
+    repetitions: int
+    planners: tuple[tuple[str, int], ...]
+    fans: tuple[int, ...]
+    batch: int
+
+
+FULL = Size(
+    15,
+    (("PDM-Closed", 15), ("PDM-Closed", 30), ("PDM-Closed", 60), ("SPDM", 60)),
+    (256, 1024, 4096),
+    16,
+)
+HALF = Size(15, (("PDM-Closed", 15), ("SPDM", 60)), (4096,), 16)
+QUICK = Size(3, (("PDM-Closed", 15),), (64,), 2)
+
+
+def fan(count: int):
+    """Deterministic ego-frame trajectories `[count, 41, 3]`: speeds x curvatures."""
+    import numpy as np
+
+    rows = int(np.sqrt(count))
+    index = np.arange(count)
+    speed = 0.5 + 15.0 * (index // rows) / max(1, (count - 1) // rows)
+    curvature = 0.06 * (2 * (index % rows) / max(1, rows - 1) - 1)
+    way = speed[:, None] * np.arange(41) * 0.1
+    heading = curvature[:, None] * way
+    step = np.diff(way, axis=1, prepend=0.0)
+    x = np.cumsum(step * np.cos(heading), axis=1)
+    y = np.cumsum(step * np.sin(heading), axis=1)
+    return np.stack([x, y, heading], axis=-1)
+
+
+class Stopwatch:
+    """Times calls between repetitions of the yardstick."""
+
+    def __init__(self, repetitions: int):
+        import numpy as np
+
+        self._repetitions = repetitions
+        self._matrix = np.random.default_rng(0).normal(size=(1024, 1024)).astype(np.float32)
+
+    def _yardstick(self) -> float:
+        started = time.perf_counter()
+        self._matrix @ self._matrix
+        return time.perf_counter() - started
+
+    def __call__(self, call) -> dict[str, float]:
+        """First call apart, two warm-ups, then interleaved repetitions; milliseconds."""
+        import numpy as np
+
+        started = time.perf_counter()
+        call()
+        first = time.perf_counter() - started
+        call()
+        self._yardstick()
+        runs, sticks = [], []
+        for _ in range(self._repetitions):
+            sticks.append(self._yardstick())
+            started = time.perf_counter()
+            call()
+            runs.append(time.perf_counter() - started)
+        return {
+            "first_call_s": first,
+            "median_ms": 1e3 * float(np.median(runs)),
+            "min_ms": 1e3 * min(runs),
+            "yardstick_ms": 1e3 * float(np.median(sticks)),
+        }
+
+
+def measure(size: Size, precision: str) -> list[dict[str, Any]]:
+    """Runs all rows of one child process."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    if precision == "f64":
+        jax.config.update("jax_enable_x64", True)
+    from spdm_jax import api, from_raw, functional, pdm_closed, plan, score, spdm
+    from spdm_jax.synthetic import make_scene, scene_names
+
+    dtype = jnp.float64 if precision == "f64" else jnp.float32
+    watch = Stopwatch(size.repetitions)
+    scenes = from_raw([make_scene(*SCENE)])
+    device = functional.to_device(scenes.batch, dtype).replace(origin=jnp.zeros((1, 2), dtype))
+    scene = jax.tree.map(lambda leaf: leaf[0], device)
+    now = int(scenes.batch.num_history[0])
+    about = {
+        "objects": int(scenes.batch.tracks.valid[0, :, now].sum()),
+        "polygons": int(scenes.batch.map.lanes.valid.sum()),
+        "edges": int(scenes.batch.map.lanes.polygon.valid.sum()),
+    }
+    rows = []
+
+    def add(workload: str, count: int, call, **more: Any):
+        print(f"{precision} on {os.environ['BENCH_CORES']} core(s): {workload}", file=sys.stderr)
+        rows.append({"workload": workload, "num_proposals": count, **about, **more, **watch(call)})
+
+    for name, count in size.planners:
+        planner = pdm_closed(count) if name == "PDM-Closed" else spdm(count)
+        config = api.fit_config(scenes, planner.config)
+        params = jax.tree.map(lambda value: jnp.asarray(value, dtype), planner.params)
+        step = jax.jit(lambda s, p, c=config: functional.plan(s, p, c))
+        result = jax.block_until_ready(step(scene, params))
+        failing = float(np.mean(np.asarray(result.scores.no_at_fault_collision) < 1))
+        step.clear_cache()
+        add(
+            f"{name} {count}",
+            count,
+            lambda f=step, p=params: jax.block_until_ready(f(scene, p)),
+            share_in_collision=failing,
+        )
+    for count in size.fans:
+        vocabulary = fan(count)
+        whole = score(scenes, vocabulary, precision=precision)
+        part = score(scenes, vocabulary[: count // 2], precision=precision)
+        # Progress is relative to the set; everything else must not depend on the company.
+        for term in ("no_at_fault_collision", "drivable_area", "time_to_collision", "comfort"):
+            if not np.array_equal(getattr(whole, term)[:, : count // 2], getattr(part, term)):
+                raise RuntimeError(f"{term} of {count} trajectories depends on the chunk")
+        add(
+            f"track + score {count}",
+            count,
+            lambda v=vocabulary: score(scenes, v, precision=precision),
+            share_in_collision=float(np.mean(whole.no_at_fault_collision < 1)),
+        )
+    names = [name for name in scene_names() if name != "roundabout"]
+    many = from_raw(make_scene(names[i % len(names)], i) for i in range(size.batch))
+    planner = spdm(60) if len(size.planners) > 1 else pdm_closed(15)
+    count = 60 if len(size.planners) > 1 else 15
+    add(f"{size.batch} scenes x {count}", count, lambda: plan(many, planner, precision=precision))
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Plain-text table of all rows."""
+    head = (
+        f"{'workload':<20} {'dtype':>5} {'cores':>5} {'median ms':>10} {'min ms':>9} "
+        f"{'first s':>8} {'yardstick':>9} {'ratio':>7}  reference (quoted)"
+    )
+    lines = [head]
+    for row in rows:
+        ratio = row["median_ms"] / row["yardstick_ms"]
+        lines.append(
+            f"{row['workload']:<20} {row['precision']:>5} {row['cores']:>5} "
+            f"{row['median_ms']:>10.2f} {row['min_ms']:>9.2f} {row['first_call_s']:>8.1f} "
+            f"{row['yardstick_ms']:>9.1f} {ratio:>7.2f}  {QUOTED.get(row['workload'], '')}"
+        )
+    return "\n".join(lines)
+
+
+def _child(cores: int, precision: str, scale: str) -> list[dict[str, Any]]:
+    """Starts one pinned child and reads its rows."""
+    environment = {**os.environ, "BENCH_CORES": str(cores)}
+    # One thread for the yardstick; settings that pin an old kernel slow a current NumPy.
+    for name in ("OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE"):
+        environment.pop(name, None)
+    environment.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    command = [sys.executable, "-m", "spdm_experiments.bench", "--child", f"{cores}:{precision}"]
+    run = subprocess.run(
+        [*command, "--scale", scale], env=environment, stdout=subprocess.PIPE, text=True, check=True
+    )
+    rows = json.loads(run.stdout.splitlines()[-1])
+    return [{**row, "cores": cores, "precision": precision} for row in rows]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the benchmark and writes `bench.json`."""
+    parser = argparse.ArgumentParser(prog="python -m spdm_experiments.bench", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/bench"))
+    parser.add_argument("--quick", action="store_true", help="a toy run that shows it works")
+    parser.add_argument("--child", default="", help=argparse.SUPPRESS)
+    parser.add_argument("--scale", default="full", help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    if options.child:
+        cores, precision = options.child.split(":")
+        if hasattr(os, "sched_setaffinity"):
+            usable = sorted(os.sched_getaffinity(0))[: int(cores)]
+            os.sched_setaffinity(0, usable)
+        size = {"full": FULL, "half": HALF, "quick": QUICK}[options.scale]
+        print(json.dumps(measure(size, precision)))
+        return 0
+    cases = [(2, "f32", "full"), (1, "f32", "half"), (2, "f64", "half"), (1, "f64", "half")]
+    if options.quick:
+        cases = [(1, "f32", "quick")]
+    rows = [row for case in cases for row in _child(*case)]
+    import jax
+
+    from spdm_experiments.runtime import commit
+
+    about = {
+        "machine": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "scene": f"{SCENE[0]}-{SCENE[1]}",
+    }
+    options.out.mkdir(parents=True, exist_ok=True)
+    target = options.out / "bench.json"
+    partial = target.with_suffix(".tmp")
+    partial.write_text(json.dumps({"about": about, "rows": rows}, indent=1), encoding="utf-8")
+    partial.replace(target)
+    print(", ".join(f"{key} {value}" for key, value in about.items()))
+    print(table(rows))
+    print(f"written: {target}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
