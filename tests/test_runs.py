@@ -13,7 +13,7 @@ import subprocess
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -204,7 +204,7 @@ def run_plan(source: Path, out: Path, *more: str) -> int:
 
 def test_keep_drops_the_filling_rows(found: Survey, fake: dict[str, Any]):
     scenes = load(found.paths[:3], padding=found.padding)
-    result = runs.plan_scenes(scenes, pdm_closed(), precision="f32")
+    result = cast(Any, runs).plan_scenes(scenes, pdm_closed(), precision="f32")
     kept = keep(result, 2)
     assert [info.token for info in kept.infos] == TOKENS[:2]
     assert {leaf.shape[0] for leaf in jax.tree.leaves((kept.scores, kept.plans, kept.tracked))} == {

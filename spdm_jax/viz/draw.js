@@ -239,9 +239,13 @@ function drawLabel(ctx, view, w, h, moment, scene) {
   ctx.font = "12.5px system-ui, sans-serif";
   const width = Math.max(...text.map((t) => ctx.measureText(t).width)) + 14;
   const height = 16 * text.length + 8;
-  // Away from the middle, where the proposals are, and always inside the picture.
-  const left = Math.min(Math.max(x < w / 2 ? x - width - 40 : x + 40, 6), w - width - 6);
-  const top = Math.min(Math.max(y < h / 2 ? y - height - 45 : y + 45, 6), h - height - 6);
+  // In the nearest corner that does not hide the place itself; the scale bar has the fourth.
+  const corners = [[6, 6], [w - width - 6, 6], [w - width - 6, h - height - 6]];
+  const away = ([cx, cy]) => {
+    const d = Math.hypot(cx + width / 2 - x, cy + height / 2 - y);
+    return d > 150 ? d : 1e4 - d;
+  };
+  const [left, top] = corners.reduce((a, c) => (away(c) < away(a) ? c : a));
   ctx.strokeStyle = ink.failure;
   ctx.lineWidth = 1.2;
   ctx.beginPath();

@@ -186,7 +186,7 @@ def test_show_displays_inline_in_notebooks(
     assert source and html.unescape(source[1]) == render(scenes, plans, index=2)
 
 
-# ---- in a browser ------------------------------------------------------------------------------
+# ---- in a browser ----
 
 ACTIONS = """<script>
 const told = [];
