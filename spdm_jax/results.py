@@ -51,7 +51,8 @@ class Explanation:
       lost: one sentence per term that cost points.
       agent: source id of the object of the first at-fault collision or TTC violation, or None.
       step: its time index (0.1 s), or None.
-      rule: name of the term that cost most, or None.
+      rule: name of the first term that cost points, in the order collision, area, direction, TTC,
+        comfort, progress; or None.
     """
 
     token: str
@@ -160,7 +161,7 @@ class ScoreSet:
         # The best proposal's own ratio may be 1 less a rounding.
         if at("progress") < 1 - 1e-6:
             lost.append(
-                f"progress {at('progress_raw'):.1f} m, {100 * at('progress'):.0f} % of the best "
+                f"progress {at('progress_raw'):.1f} m, {100 * at('progress'):.1f} % of the best "
                 "admissible proposal"
             )
             blame("progress", None)

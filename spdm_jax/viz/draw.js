@@ -231,7 +231,8 @@ function drawLabel(ctx, view, w, h, moment, scene) {
   const text = [moment.label];
   if (moment.object >= 0) {
     const object = scene.objects[moment.object];
-    text.push(`${data.kinds[object.kind].name} ${object.id}`);
+    const id = object.id.length > 12 ? `${object.id.slice(0, 8)}…` : object.id;
+    text.push(`${data.kinds[object.kind].name} ${id}`);
   }
   const at = pose(moment.pose ?? moment.ego, 0);
   const x = w / 2 + (at[0] - view.x) * view.scale;

@@ -121,7 +121,7 @@ def plot_scene(
     if view is not None and telling is not None:
         _draw_failure(ax, view, telling, objects, vehicle, center, reach)
     _finish(ax, center, reach, info, view, step)
-    _legend(ax, objects, poses, center, reach, view, bool(world.red))
+    _legend(ax, objects, poses, center, reach, view, world)
     return ax
 
 
@@ -307,7 +307,8 @@ def _failure_text(
     text = moment.label
     if moment.object >= 0:
         kind = OBJECT_NAMES[ObjectType(int(objects.type[moment.object]))]
-        text += f"\n{kind} {objects.ids[moment.object]}"
+        name = objects.ids[moment.object]
+        text += f"\n{kind} {name if len(name) <= 12 else name[:8] + '…'}"
     whose = "chosen" if row == view.best else "best failing"
     text += f"\n({whose} proposal, score {view.scores['total'][row]:.2f})"
     at = moment.ego if moment.object_pose is None else moment.object_pose
@@ -384,7 +385,7 @@ def _legend(
     center: np.ndarray,
     reach: float,
     view: PlanView | None,
-    red: bool,
+    world: MapView,
 ) -> None:
     """Names what can be seen in the picture, below it."""
     from matplotlib.artist import Artist
@@ -400,7 +401,10 @@ def _legend(
     for kind in sorted({int(k) for k in objects.type[near]}):
         color, name = OBJECT_COLORS[ObjectType(kind)], OBJECT_NAMES[ObjectType(kind)]
         entries.append(Patch(fc=color, ec=ink, lw=0.7, label=name))
-    if red:
+    if world.crosswalks:
+        edge = MAP_COLORS["road_edge"]
+        entries.append(Patch(fc=MAP_COLORS["crosswalk"], ec=edge, hatch="///", label="crosswalk"))
+    if world.red:
         entries.append(Line2D([], [], color=MAP_COLORS["red"], lw=2.5, label="red light"))
     if view is not None:
         entries.append(

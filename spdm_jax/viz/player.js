@@ -37,7 +37,8 @@ function writeTable() {
   const plan = planOf(state.planner);
   const body = document.querySelector("#rows tbody");
   const rank = plan.row.map((_, i) => i)
-    .sort((a, b) => (plan.scores.total[b] ?? -1) - (plan.scores.total[a] ?? -1) || a - b);
+    .sort((a, b) => (plan.scores.total[b] ?? -1) - (plan.scores.total[a] ?? -1)
+      || (b === plan.best) - (a === plan.best) || a - b); // scores are rounded, so the best may tie
   body.replaceChildren(...rank.map((i) => {
     const row = element("tr", undefined, { tabindex: "0", "data-proposal": String(i) });
     const first = element("td");
@@ -99,6 +100,7 @@ function writeLegend() {
     item(ink.ego, "ego"),
     item(ink.route, "route"),
     ...kinds.map((k) => item(data.kinds[k].color, data.kinds[k].name)),
+    ...(scene.map.crosswalks.length ? [item(ink.crosswalk, "crosswalk")] : []),
     ...(scene.map.red.length ? [item(ink.red, "red light", "line")] : []),
     item(ink.ink, "chosen", "line"),
     item("#1f78d1", "hovered or pinned", "line"),

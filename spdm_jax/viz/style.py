@@ -47,7 +47,7 @@ MAP_COLORS: Final = {
     "road": "#e4e7eb",
     "road_edge": "#aab1ba",
     "route": "#c9def2",
-    "crosswalk": "#ffffff",
+    "crosswalk": "#f6f0d0b0",  # see-through: some maps cover whole junctions with one crossing
     "lane": "#ffffff",
     "centerline": "#b3bac3",
     "red": "#d11a2a",

@@ -148,6 +148,17 @@ def test_objects_without_forecast_are_known_at_the_start_only(scenes: ScenarioSe
     assert np.isnan(object_poses(objects, view.forecast, 2)).all(axis=1).sum() == 1
 
 
+def test_ignored_objects_are_told_apart(scenes: ScenarioSet, plans: PlanSet):
+    index = row_of(scenes, "platoon")
+    ignored = np.zeros_like(plans.forecast.valid)
+    row = int(np.argmax(plans.forecast.valid[index]))
+    ignored[index, row] = True
+    _, objects, view = view_of(
+        scenes, replace(plans, forecast=plans.forecast.replace(ignored=ignored)), index
+    )
+    assert objects.track[view.ignored].tolist() == [plans.forecast.track[index, row]]
+
+
 def test_objects_stand_halfway_between_samples(scenes: ScenarioSet, plans: PlanSet):
     _, objects, view = view_of(scenes, plans, row_of(scenes, "platoon"))
     forecast = view.forecast.copy()
