@@ -36,7 +36,7 @@ def test_units(golden: Path, tmp_path: Path, precision: str):
     assert "0 failed" in compare(tmp_path, precision)
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
 def test_a_scene(golden: Path, tmp_path: Path, precision: str):
     scene = sorted(path.name for path in golden.glob("scorer_*.npz"))[0].removeprefix("scorer_")
     for kind in ("scene", "scorer"):
