@@ -141,18 +141,18 @@ def measure(size: Size, precision: Literal["f32", "f64"]) -> list[dict[str, Any]
         rows[-1]["share_in_collision"] = float(np.mean(safe < 1))
     for count in size.fans:
         vocabulary = fan(count)
-        whole = score(scenes, vocabulary, precision=precision)
-        part = score(scenes, vocabulary[: count // 2], precision=precision)
-        # Progress is relative to the set; everything else must not depend on the company.
-        for term in ("no_at_fault_collision", "drivable_area", "time_to_collision", "comfort"):
-            if not np.array_equal(getattr(whole, term)[:, : count // 2], getattr(part, term)):
-                raise RuntimeError(f"{term} of {count} trajectories depends on the chunk")
         add(
             f"track + score {count}",
             count,
             lambda v=vocabulary: score(scenes, v, precision=precision),
-            share_in_collision=float(np.mean(whole.no_at_fault_collision < 1)),
         )
+        whole = score(scenes, vocabulary, precision=precision)
+        part = score(scenes, vocabulary[: count // 2], precision=precision)
+        rows[-1]["share_in_collision"] = float(np.mean(whole.no_at_fault_collision < 1))
+        # Progress is relative to the set; everything else must not depend on the company.
+        for term in ("no_at_fault_collision", "drivable_area", "time_to_collision", "comfort"):
+            if not np.array_equal(getattr(whole, term)[:, : count // 2], getattr(part, term)):
+                raise RuntimeError(f"{term} of {count} trajectories depends on the chunk")
     names = [name for name in scene_names() if name != "roundabout"]
     many = from_raw(make_scene(names[i % len(names)], i) for i in range(size.batch))
     planner = spdm(60) if len(size.planners) > 1 else pdm_closed(15)
