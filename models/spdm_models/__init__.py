@@ -1,1 +1,1 @@
-"""Flax models on the evaluator's data structures."""
+"""Flax models on the evaluator's data structures; none is ported yet."""
