@@ -190,7 +190,7 @@ def target_speeds(speed_limit: jax.Array, params: PlannerParams) -> jax.Array:
     return params.speed_fractions * limit
 
 
-def _merge(stage1: Stage1, stage2: tuple | None, route_paths: RouteLanePaths | None):
+def merge(stage1: Stage1, stage2: tuple | None, route_paths: RouteLanePaths | None):
     """Joins both stages into a `ProposalSet` `[P, 41]`."""
     num_paths, num_policies, _ = stage1.x.shape
     count = num_paths * num_policies
@@ -266,7 +266,7 @@ def decide(
         stage2 = None
         if route_paths is not None:
             stage2 = drive(route_paths, ego, target_speed, params.spline, NUM_TRAJECTORY_STATES)
-        proposals = _merge(stage1, stage2, route_paths)
+        proposals = merge(stage1, stage2, route_paths)
     with jax.named_scope("track"):
         reference = (proposals.x, proposals.y, proposals.heading)
         tracked, _ = track(*reference, ego, vehicle, params.tracker, config.tracker)

@@ -139,6 +139,11 @@ def measure(size: Size, precision: Literal["f32", "f64"]) -> list[dict[str, Any]
         add(f"{name} {count}", count, lambda f=step, p=params: jax.block_until_ready(f(scene, p)))
         safe = np.asarray(step(scene, params).scores.no_at_fault_collision)
         rows[-1]["share_in_collision"] = float(np.mean(safe < 1))
+    for name, count in size.planners:
+        planner = pdm_closed(count) if name == "PDM-Closed" else spdm(count)
+        config = api.fit_config(scenes, planner.config)
+        for stage, call in stages(scene, planner.params, config):
+            add(f"{name} {count}: {stage}", count, call)
     for count in size.fans:
         vocabulary = fan(count)
         add(
@@ -161,17 +166,129 @@ def measure(size: Size, precision: Literal["f32", "f64"]) -> list[dict[str, Any]
     return rows
 
 
+def stages(scene, params, config) -> list[tuple[str, Any]]:
+    """The stages of one planning step, each compiled alone and fed by the one before.
+
+    Returns:
+      Names and calls; each call waits for its result.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from spdm_jax import decision, planner
+    from spdm_jax.geometry import ego_box
+    from spdm_jax.proposals import idm, lanes, spline
+    from spdm_jax.scoring.score import World, score_trajectories
+    from spdm_jax.tracking.lqr import track
+
+    params = decision.cast_params(params, scene.ego.x.dtype)
+    vehicle, ego = params.vehicle, planner.observe(scene, 0).ego
+    calls: list[tuple[str, Any]] = []
+
+    def run(name: str, function, *arguments):
+        compiled = jax.jit(function)
+        calls.append((name, lambda: jax.block_until_ready(compiled(*arguments))))
+        # Evaluated by another compiled copy, so that the timed one still has to compile.
+        return jax.jit(lambda *values: function(*values))(*arguments)
+
+    state = run("init", lambda s: planner.init(s, params, config), scene)
+    seen = run(
+        "see", lambda s, m: planner.see(s, planner.observe(s, 0), m, params, config), scene, state
+    )
+
+    def look_up(s, now):
+        box = ego_box(now, vehicle)
+        near, parks = lanes.drivable_lanes(s.map, box.x, box.y, params.map_radius)
+        lane = lanes.starting_lane(s.map, s.route, near, now, vehicle)
+        return lane, lanes.area_masks(s.map, s.route.lane_on_route, near, parks)
+
+    lane, masks = run("look up lanes", look_up, scene, ego)
+    targets = decision.target_speeds(scene.map.lanes.speed_limit[lane], params)
+    start = jax.vmap(lambda path: idm.project(path, ego.x, ego.y))(state.paths)
+    contents = run(
+        "corridors",
+        lambda p, at, v, w: idm.corridor_contents(p, at, v.max(), w.forecast, w.red, vehicle),
+        state.paths,
+        start,
+        targets,
+        seen,
+    )
+    run(
+        "IDM rollout",
+        lambda p, at, now, v, w, c: idm.rollout(
+            p, at, now.vx, v, w.forecast, w.red, c, vehicle, params.idm, 41
+        ),
+        state.paths,
+        start,
+        ego,
+        targets,
+        seen,
+        contents,
+    )
+    stage1 = jax.jit(lambda p, now, v, w: decision.stage1_proposals(p, now, v, w, params))(
+        state.paths, ego, targets, seen
+    )
+    center = jax.tree.map(lambda leaf: leaf[0], state.paths)
+    routes = driven = None
+    if config.num_route_paths:
+
+        def route_lanes(s, m, now, at, v):
+            paths = spline.route_lane_paths(
+                s.map.lanes,
+                s.route,
+                m.slot,
+                s.map.lanes.roadblock[at],
+                jax.tree.map(lambda leaf: leaf[0], m.paths),
+                m.goal,
+                now,
+                params.spline,
+                config.num_route_paths,
+                config.max_path_points,
+            )
+            return paths, spline.drive(paths, now, v, params.spline, 81)
+
+        routes, driven = run("route lanes", route_lanes, scene, state, ego, lane, targets)
+    proposals = decision.merge(stage1, driven, routes)
+    tracked = run(
+        "track",
+        lambda p, now: track(p.x, p.y, p.heading, now, vehicle, params.tracker)[0],
+        proposals,
+        ego,
+    )
+    run(
+        "score",
+        lambda t, ok, m, w, path, grid: score_trajectories(
+            t, ok, World(grid, m, w.forecast, path), vehicle, params.scoring
+        ),
+        tracked,
+        proposals.valid,
+        masks,
+        seen,
+        center,
+        scene.map.grid,
+    )
+    run(
+        "extend to 8 s",
+        lambda p, v, one, w: decision.extend_stage1(p, jnp.int32(0), v, one, w, params),
+        state.paths,
+        targets,
+        stage1,
+        seen,
+    )
+    return calls
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Plain-text table of all rows."""
     head = (
-        f"{'workload':<20} {'dtype':>5} {'cores':>5} {'median ms':>10} {'min ms':>9} "
+        f"{'workload':<28} {'dtype':>5} {'cores':>5} {'median ms':>10} {'min ms':>9} "
         f"{'first s':>8} {'yardstick':>9} {'ratio':>7}  reference (quoted)"
     )
     lines = [head]
     for row in rows:
         ratio = row["median_ms"] / row["yardstick_ms"]
         lines.append(
-            f"{row['workload']:<20} {row['precision']:>5} {row['cores']:>5} "
+            f"{row['workload']:<28} {row['precision']:>5} {row['cores']:>5} "
             f"{row['median_ms']:>10.2f} {row['min_ms']:>9.2f} {row['first_call_s']:>8.1f} "
             f"{row['yardstick_ms']:>9.1f} {ratio:>7.2f}  {QUOTED.get(row['workload'], '')}"
         )
