@@ -23,7 +23,7 @@ NUM = 8
 
 
 def _load(name: str) -> ModuleType:
-    """Loads a helper once for all test modules, so that they share its compiled functions."""
+    """Loads a file once for all test modules, so that they share its compiled functions."""
     if name not in sys.modules:
         path = FilePath(__file__).with_name(f"{name}.py")
         spec = importlib.util.spec_from_file_location(name, path)
@@ -63,6 +63,14 @@ def plans(scenes: ScenarioSet) -> PlanSet:
 
 def run(scenes: ScenarioSet, trajectories: Any = TRAJECTORIES, **options: Any) -> ScoreSet:
     return spdm_jax.score(scenes, trajectories, precision="f64", **options)
+
+
+def standing(scenes: ScenarioSet) -> np.ndarray:
+    """`[B, A, 41, 3]` the parked car where it is, nobody else."""
+    tracks, at = scenes.batch.tracks, int(scenes.batch.num_history[0])
+    forecast = np.full((2, tracks.valid.shape[1], 41, 3), np.nan)
+    forecast[0, 0] = tracks.x[0, 0, at], tracks.y[0, 0, at], tracks.heading[0, 0, at]
+    return forecast
 
 
 def same(one: ScoreSet, other: ScoreSet, tolerance: float = 1e-9) -> None:
@@ -172,7 +180,8 @@ def test_longer_trajectories_are_cut(scenes: ScenarioSet):
 
 def test_trackers(scenes: ScenarioSet):
     speeds = np.linspace(0, 14, NUM)
-    reference, none = (run(scenes, tracker=name) for name in ("reference", "none"))
+    reference = run(scenes)
+    none = run(scenes, tracker="none", forecast=standing(scenes))
     # Untracked poses are where they were said to be; tracked ones start at the ego's speed.
     np.testing.assert_allclose(
         none.tracked.x[0], TRAJECTORIES[..., 0] + none.tracked.x[0, :, :1], atol=1e-9
@@ -196,24 +205,24 @@ def test_full_states_are_scored_as_they_are(scenes: ScenarioSet):
     tracked = run(scenes)
     states = np.stack([getattr(tracked.tracked, n) for n in EgoState.__dataclass_fields__], -1)
     for tracker in ("reference", "none"):
-        again = run(scenes, states, frame="local", tracker=tracker)
+        again = run(scenes, states, frame="local", tracker=tracker, forecast=standing(scenes))
         same(tracked, again, 1e-6)
         np.testing.assert_allclose(again.tracked.steering, tracked.tracked.steering, atol=1e-12)
 
 
 def test_supplied_forecast_replaces_the_own_one(scenes: ScenarioSet):
-    tracks = scenes.batch.tracks
-    forecast = np.full((2, tracks.valid.shape[1], 41, 3), np.nan)
-    nobody = run(scenes, forecast=forecast)
+    tracked = run(scenes).tracked
+    states = np.stack([getattr(tracked, n) for n in EgoState.__dataclass_fields__], -1)
+    forecast = standing(scenes)
+    stays = run(scenes, states, frame="local", forecast=forecast)
+    assert (stays.scores.no_at_fault_collision < 1).any()
+    nobody = run(scenes, states, frame="local", forecast=np.full_like(forecast, np.nan))
     np.testing.assert_array_equal(nobody.scores.no_at_fault_collision, 1)
     np.testing.assert_array_equal(nobody.scores.time_to_collision, 1)
     # The parked car drives away at 20 m/s.
-    at = int(scenes.batch.num_history[0])
-    forecast[0, 0, :, 0] = tracks.x[0, 0, at] + 4.0 * np.arange(41)
-    forecast[0, 0, :, 1], forecast[0, 0, :, 2] = tracks.y[0, 0, at], 0.0
-    away = run(scenes, forecast=forecast)
+    forecast[0, 0, :, 0] += 4.0 * np.arange(41)
+    away = run(scenes, states, frame="local", forecast=forecast)
     np.testing.assert_array_equal(away.scores.no_at_fault_collision, 1)
-    assert (run(scenes).scores.no_at_fault_collision < 1).any()
 
 
 def test_explanation_names_rule_object_and_time(scenes: ScenarioSet):

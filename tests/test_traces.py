@@ -29,7 +29,7 @@ from spdm_jax.padding import PaddingConfig
 
 
 def _load(name: str) -> ModuleType:
-    """Loads a helper once for all test modules, so that they share its compiled functions."""
+    """Loads a file once for all test modules, so that they share its compiled functions."""
     if name not in sys.modules:
         path = FilePath(__file__).with_name(f"{name}.py")
         spec = importlib.util.spec_from_file_location(name, path)

@@ -188,27 +188,29 @@ def smooth(signal: np.ndarray, window: int, order: int, derivative: int = 0) -> 
     return out
 
 
-def comfort(states: np.ndarray) -> np.ndarray:
-    """The six flags of one trajectory."""
+def comfort_signals(states: np.ndarray) -> np.ndarray:
+    """`[6, 41]` filtered signals of one trajectory."""
     heading, ax, ay = states[:, 2], states[:, 5], states[:, 6]
-    heading = np.concatenate(
-        [
-            [heading[0]],
-            heading[1:] - 2 * np.pi * np.cumsum(np.round(np.diff(heading) / (2 * np.pi))),
-        ]
-    )
+    turns = np.cumsum(np.round(np.diff(heading) / (2 * np.pi)))
+    heading = np.concatenate([[heading[0]], heading[1:] - 2 * np.pi * turns])
     jerk = lambda signal: smooth(np.round(smooth(signal, 8, 2), 8), 41, 2, 1)
     signals = [
-        (smooth(ax, 41, 2), -4.05, 2.40),
-        (smooth(ay, 41, 2), -4.89, 4.89),
-        (jerk(np.hypot(ax, ay)), -8.37, 8.37),
-        (jerk(ax), -4.13, 4.13),
-        (smooth(heading, 5, 3, 2), -1.93, 1.93),
-        (smooth(heading, 5, 2, 1), -0.95, 0.95),
+        smooth(ax, 41, 2),
+        smooth(ay, 41, 2),
+        jerk(np.hypot(ax, ay)),
+        jerk(ax),
+        smooth(heading, 5, 3, 2),
+        smooth(heading, 5, 2, 1),
     ]
-    return np.array(
-        [np.all((np.round(s, 8) > low) & (np.round(s, 8) < high)) for s, low, high in signals]
-    )
+    return np.round(signals, 8)
+
+
+def comfort(states: np.ndarray) -> np.ndarray:
+    """The six flags of one trajectory."""
+    low = np.array([-4.05, -4.89, -8.37, -4.13, -1.93, -0.95])[:, None]
+    high = np.array([2.40, 4.89, 8.37, 4.13, 1.93, 0.95])[:, None]
+    signals = comfort_signals(states)
+    return np.all((signals > low) & (signals < high), axis=1)
 
 
 def totals(rows: list[dict]) -> tuple[np.ndarray, np.ndarray]:
