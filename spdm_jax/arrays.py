@@ -4,6 +4,8 @@ XLA lowers `cumsum`, sorting and `nonzero` to long chains of operations on a CPU
 here, a triangular matrix product and pairwise comparisons do the same in a few.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,22 +28,49 @@ def prefix_sum(values: jax.Array) -> jax.Array:
     return within.reshape(*values.shape[:-1], rows * _ROW)[..., :size]
 
 
-def prefix_count(flags: jax.Array) -> jax.Array:
-    """Inclusive counts of True along the last axis, int32 (exact up to 2^24 flags)."""
-    return prefix_sum(flags.astype(jnp.float32)).astype(jnp.int32)
+def prefix_count(values: jax.Array) -> jax.Array:
+    """Inclusive sums of flags or small counts along the last axis, int32 (exact up to 2^24)."""
+    return prefix_sum(values.astype(jnp.float32)).astype(jnp.int32)
 
 
-def nth_true(counts: jax.Array, n: jax.Array) -> jax.Array:
-    """Positions of the n-th True (from 1) given `prefix_count` of the flags; last one if absent."""
-    index = jnp.searchsorted(counts, n, side="left", method="scan")
-    return jnp.minimum(index, counts.shape[0] - 1).astype(jnp.int32)
+class TrueEntries(NamedTuple):
+    """Where a row of flags is True, ready to be asked for the n-th.
+
+    Attributes:
+      within: `[R, 64]` int32 inclusive counts in each row of 64 flags.
+      before: `[R]` int32 True flags in the rows before.
+      total: `[]` int32.
+    """
+
+    within: jax.Array
+    before: jax.Array
+    total: jax.Array
+
+
+def true_entries(flags: jax.Array) -> TrueEntries:
+    """Counts the True entries of `[N]` flags."""
+    rows = -(-flags.shape[0] // _ROW)
+    table = jnp.pad(flags, (0, rows * _ROW - flags.shape[0])).reshape(rows, _ROW)
+    within = prefix_count(table)
+    ends = prefix_count(within[:, -1])
+    return TrueEntries(within, ends - within[:, -1], ends[-1])
+
+
+def nth_true(entries: TrueEntries, n: jax.Array) -> jax.Array:
+    """Positions of the n-th True, from 1; some valid position where there are fewer."""
+    row = jnp.sum(entries.before < n[..., None], axis=-1, dtype=jnp.int32) - 1
+    row = jnp.maximum(row, 0)
+    rest = n - entries.before[row]
+    column = jnp.sum(entries.within[row] < rest[..., None], axis=-1, dtype=jnp.int32)
+    return row * _ROW + jnp.minimum(column, _ROW - 1)
 
 
 def true_indices(flags: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
-    """First `size` positions of True, and which of them are real."""
-    counts = prefix_count(flags)
+    """First `size` positions of True, and which of them are real; the others are 0."""
+    entries = true_entries(flags)
     wanted = jnp.arange(1, size + 1, dtype=jnp.int32)
-    return nth_true(counts, wanted), wanted <= counts[-1]
+    real = wanted <= entries.total
+    return jnp.where(real, nth_true(entries, wanted), 0), real
 
 
 def rank_of(*keys: jax.Array) -> jax.Array:

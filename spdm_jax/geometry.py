@@ -32,14 +32,15 @@ class Box(NamedTuple):
 
 
 def wrap(angle: jax.Array) -> jax.Array:
-    """Wraps angles to (-pi, pi] by atan2 (tuplan_garage `normalize_angle`)."""
-    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+    """Wraps angles to [-pi, pi] (tuplan_garage `normalize_angle`; differs: no trigonometry)."""
+    turn = jnp.asarray(2 * jnp.pi, angle.dtype)
+    return angle - turn * jnp.round(angle / turn)
 
 
 def principal(angle: jax.Array) -> jax.Array:
-    """Wraps angles to [-pi, pi) by modulo (nuPlan `principal_value`)."""
-    pi = jnp.asarray(jnp.pi, angle.dtype)
-    return jnp.mod(angle + pi, 2 * pi) - pi
+    """Wraps angles to [-pi, pi) (nuPlan `principal_value`)."""
+    turn = jnp.asarray(2 * jnp.pi, angle.dtype)
+    return angle - turn * jnp.floor(angle / turn + 0.5)
 
 
 def box_at(x, y, heading, half_length, half_width) -> Box:
@@ -222,6 +223,65 @@ def project(path: Path, px: jax.Array, py: jax.Array) -> jax.Array:
     return start + t * (end - start)
 
 
+_RUN = 32  # segments that `project_many` compares as one circle first
+
+
+def project_many(path: Path, px: jax.Array, py: jax.Array) -> jax.Array:
+    """`project` for many points `[N]`.
+
+    Runs of segments, as circles, bound the distance from below; each point looks into the nearest
+    runs until no other can hold a nearer segment.
+    """
+    size = path.x.shape[0] - 1
+    spare = -size % _RUN
+    index = jnp.arange(size + spare).reshape(-1, _RUN)
+    begin, end = jnp.minimum(index, size), jnp.minimum(index + 1, size)
+    used = index < jnp.maximum(path.count - 1, 1)
+    ax, ay, bx, by = path.x[begin], path.y[begin], path.x[end], path.y[end]
+    far = jnp.asarray(1e9, px.dtype)
+
+    def middle(a, b):
+        low = jnp.min(jnp.where(used, jnp.minimum(a, b), far), axis=1)
+        high = jnp.max(jnp.where(used, jnp.maximum(a, b), -far), axis=1)
+        return 0.5 * (low + high)
+
+    cx, cy = middle(ax, bx), middle(ay, by)
+    reach = jnp.maximum(
+        jnp.hypot(ax - cx[:, None], ay - cy[:, None]),
+        jnp.hypot(bx - cx[:, None], by - cy[:, None]),
+    )
+    radius = jnp.max(jnp.where(used, reach, 0), axis=1)
+    # Squared like the distances. A little slack: rounding must not skip the nearest segment's run.
+    low = jnp.hypot(px[:, None] - cx, py[:, None] - cy) - 1.0001 * radius - 1e-3
+    low = jnp.where(jnp.any(used, axis=1), jnp.square(jnp.maximum(low, 0)), jnp.inf)
+    start = path.progress[begin]
+    stop = jnp.where(index + 1 < path.count, path.progress[end], start)
+    table = jnp.stack([ax, ay, bx, by, start, stop])
+
+    def look(state):
+        low, least, progress = state
+        run = jnp.argmin(low, axis=1)
+        open_ = jnp.min(low, axis=1) <= least
+        x0, y0, x1, y1, s0, s1 = table[:, run]
+        square, t = point_segment_sq(px[:, None], py[:, None], x0, y0, x1, y1)
+        square = jnp.where(used[run] & open_[:, None], square, jnp.inf)
+        best = jnp.argmin(square, axis=1)[:, None]
+        pick = lambda v: jnp.take_along_axis(v, best, axis=1)[:, 0]
+        square, at = pick(square), pick(s0 + t * (s1 - s0))
+        # Of equally near points the first on the path counts.
+        better = (square < least) | ((square == least) & (at < progress))
+        seen = jnp.arange(low.shape[1]) == run[:, None]
+        return (
+            jnp.where(seen, jnp.inf, low),
+            jnp.where(better, square, least),
+            jnp.where(better, at, progress),
+        )
+
+    some_open = lambda state: jnp.any(jnp.min(state[0], axis=1) < state[1])
+    limit = jnp.full_like(px, jnp.inf)
+    return jax.lax.while_loop(some_open, look, (low, limit, limit))[2]
+
+
 def interpolate(path: Path, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Pose at arc lengths `[...]`, clipped to [1e-5, length]; heading wrapped to (-pi, pi].
 
@@ -229,7 +289,7 @@ def interpolate(path: Path, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
     """
     s = jnp.clip(s, jnp.minimum(jnp.asarray(1e-5, s.dtype), path.length), path.length)
     # Few points: count; many: bisect. (An unrolled bisection compiles for seconds.)
-    method = "compare_all" if s.size < 128 else "scan"
+    method = "compare_all" if s.size * path.x.shape[0] <= 2**15 else "scan"
     index = jnp.searchsorted(path.progress, s, side="left", method=method)
     index = jnp.clip(index, 1, jnp.maximum(path.count - 1, 1))
     p0, p1 = path.progress[index - 1], path.progress[index]

@@ -124,6 +124,8 @@ def to_ego(
     values: np.ndarray, frame: Frame, ego_pose: np.ndarray, origin: np.ndarray
 ) -> np.ndarray:
     """Inverse of `to_local` into the ego frame: the current pose becomes 0."""
+    if frame == "ego":
+        return values
     values = to_local(values, frame, ego_pose, origin)
     x = values[..., 0] - ego_pose[:, 0, None, None]
     y = values[..., 1] - ego_pose[:, 1, None, None]

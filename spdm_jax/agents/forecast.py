@@ -11,16 +11,16 @@ import jax.numpy as jnp
 
 from spdm_jax.agents.observation import Observation, SelectedObjects, is_agent
 from spdm_jax.config import FORECAST_DT, NUM_FORECAST
-from spdm_jax.types import AgentForecast, Tracks
+from spdm_jax.types import AgentForecast, Array, Tracks
 
 
 class ForecastPoses(NamedTuple):
     """Box-centre poses of selected objects, `[A, S]` each, every 0.2 s."""
 
-    x: jax.Array
-    y: jax.Array
-    heading: jax.Array
-    valid: jax.Array
+    x: Array
+    y: Array
+    heading: Array
+    valid: Array
 
 
 def constant_velocity(observation: Observation, selected: SelectedObjects) -> ForecastPoses:

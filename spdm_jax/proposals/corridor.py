@@ -4,21 +4,21 @@ The reference buffers the path with square caps and round joins. Here the strip 
 is the union of one rectangle per segment and one small wedge per bend, tested against each object.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from spdm_jax.agents.observation import RedLights
-from spdm_jax.arrays import nth_true, prefix_count
+from spdm_jax.arrays import nth_true, true_entries
 from spdm_jax.geometry import (
     Box,
     Path,
     boxes_overlap,
     crosses_upward_ray,
     interpolate,
-    project,
+    point_segment_sq,
     segment_meets_box,
 )
 from spdm_jax.types import AgentForecast
@@ -27,12 +27,8 @@ from spdm_jax.types import AgentForecast
 _JOIN_ANGLE = jnp.pi / 2 / 16
 BLOCK = 8
 """Segments in a run that is compared as one circle first."""
-BOXES = 128
-"""Boxes near a corridor that are looked at together."""
-PAIRS = 512
-"""(run, box) pairs tested exactly at a time."""
-POINTS = 128
-"""Points projected at a time."""
+PAIRS = 256
+"""(run, object) pairs tested exactly at a time."""
 
 
 class Corridor(struct.PyTreeNode):
@@ -180,85 +176,227 @@ class _Blocks(NamedTuple):
     radius: jax.Array  # negative where the run has no used segment
 
 
-def _blocks(axes: Corridor, pieces: _Segments, half_width: jax.Array) -> _Blocks:
-    size = pieces.used.shape[1] // BLOCK
-    group = lambda v: v.reshape(v.shape[0], size, BLOCK)
-    used = group(pieces.used)
-    far = jnp.asarray(1e9, half_width.dtype)
-    x, y = group(pieces.box.x), group(pieces.box.y)
-    low = lambda v: jnp.min(jnp.where(used, v, far), axis=2)
-    high = lambda v: jnp.max(jnp.where(used, v, -far), axis=2)
+def _blocks(x: jax.Array, y: jax.Array, reach: jax.Array, used: jax.Array) -> _Blocks:
+    """Circles around runs of pieces `[L, M]` that extend `reach` from their middle."""
+    group = lambda v: v.reshape(*v.shape[:-1], -1, BLOCK)
+    x, y, reach, used = group(x), group(y), group(reach), group(used)
+    far = jnp.asarray(1e9, x.dtype)
+    low = lambda v: jnp.min(jnp.where(used, v, far), axis=-1)
+    high = lambda v: jnp.max(jnp.where(used, v, -far), axis=-1)
     cx, cy = 0.5 * (low(x) + high(x)), 0.5 * (low(y) + high(y))
-    reach = jnp.hypot(x - cx[..., None], y - cy[..., None]) + jnp.hypot(
-        group(pieces.box.half_length), half_width
-    )
-    # A wedge lies within half a width of a rectangle's end, hence inside the same circle.
-    radius = jnp.max(jnp.where(used, reach, -1), axis=2)
+    distance = jnp.hypot(x - cx[..., None], y - cy[..., None]) + reach
+    radius = jnp.max(jnp.where(used, distance, -1), axis=-1)
     some = radius > 0
     return _Blocks(jnp.where(some, cx, 0), jnp.where(some, cy, 0), radius)
+
+
+class _Strips(NamedTuple):
+    """Rectangles around all centres of each object, `[N]` each."""
+
+    cos: jax.Array  # direction from the first to the last centre
+    sin: jax.Array
+    along: jax.Array  # middle
+    across: jax.Array
+    half_along: jax.Array
+    half_across: jax.Array
+    present: jax.Array
+
+
+def _strips(box: Box, present: jax.Array) -> _Strips:
+    """Rectangles around the centres `[S, N]`; direction of travel is the long axis."""
+    dx, dy = box.x[-1] - box.x[0], box.y[-1] - box.y[0]
+    length = jnp.hypot(dx, dy)
+    moves = length > 0
+    cos = jnp.where(moves, dx / jnp.where(moves, length, 1), 1)
+    sin = jnp.where(moves, dy / jnp.where(moves, length, 1), 0)
+    along, across = box.x * cos + box.y * sin, box.y * cos - box.x * sin
+    far = jnp.asarray(1e9, box.x.dtype)
+    low = lambda v: jnp.min(jnp.where(present, v, far), axis=0)
+    high = lambda v: jnp.max(jnp.where(present, v, -far), axis=0)
+    ends = low(along), high(along), low(across), high(across)
+    return _Strips(
+        cos,
+        sin,
+        0.5 * (ends[0] + ends[1]),
+        0.5 * (ends[2] + ends[3]),
+        0.5 * (ends[1] - ends[0]),
+        0.5 * (ends[3] - ends[2]),
+        jnp.any(present, axis=0),
+    )
+
+
+def _blocks_near(blocks: _Blocks, strips: _Strips, margin: jax.Array) -> jax.Array:
+    """Whether each run comes within a margin `[N]` of each strip, `[L, M / BLOCK, N]` bool."""
+    bx, by, radius = (v[..., None] for v in blocks)
+    # A little slack: rounding must not lose a touching pair.
+    reach = 1.0001 * (radius + margin) + 1e-3
+    along = jnp.abs(bx * strips.cos + by * strips.sin - strips.along)
+    across = jnp.abs(by * strips.cos - bx * strips.sin - strips.across)
+    near = (along <= strips.half_along + reach) & (across <= strips.half_across + reach)
+    return near & (radius > 0) & strips.present
+
+
+def _for_pairs(near: jax.Array, visit, start):
+    """Visits all (path, run, object) triples that are near, a fixed number at a time.
+
+    Args:
+      near: `[L, B, N]` bool.
+      visit: called with path, run and object `[PAIRS]`, which of them are real, and the carry.
+      start: first carry.
+    """
+    entries = true_entries(near.reshape(-1))
+
+    def some(carry):
+        part, state = carry
+        number = part * PAIRS + jnp.arange(PAIRS, dtype=jnp.int32)
+        index = nth_true(entries, number + 1)
+        path, run, item = jnp.unravel_index(index, near.shape)
+        return part + 1, visit(path, run, item, number < entries.total, state)
+
+    more = lambda carry: carry[0] * PAIRS < entries.total
+    return jax.lax.while_loop(more, some, (jnp.int32(0), start))[1]
+
+
+class _Table(NamedTuple):
+    """A pytree of `[L, M]` arrays as one, so that a run of all of them is a single gather."""
+
+    values: jax.Array  # [F, L, M]
+    tree: Any
+    dtypes: tuple
+
+    def run(self, path: jax.Array, run: jax.Array) -> jax.Array:
+        """The `BLOCK` entries of each (path, run), `[F, BLOCK, PAIRS]`."""
+        index = run * BLOCK + jnp.arange(BLOCK, dtype=run.dtype)[:, None]
+        return self.values[:, path, index]
+
+    def unpack(self, values: jax.Array):
+        """The pytree from its fields `[F, ...]`."""
+        leaves = [v.astype(t) for v, t in zip(values, self.dtypes, strict=True)]
+        return jax.tree.unflatten(self.tree, leaves)
+
+
+def _table(values) -> _Table:
+    leaves, tree = jax.tree.flatten(values)
+    dtype = jnp.result_type(*(leaf.dtype for leaf in leaves if leaf.dtype != bool))
+    stacked = jnp.stack([leaf.astype(dtype) for leaf in leaves])
+    return _Table(stacked, tree, tuple(leaf.dtype for leaf in leaves))
+
+
+def _pad_to_blocks(values: jax.Array) -> jax.Array:
+    return jnp.pad(values, ((0, 0), (0, -values.shape[1] % BLOCK)))
 
 
 def corridors_hit_boxes(
     axes: Corridor, half_width: jax.Array, box: Box, present: jax.Array
 ) -> jax.Array:
-    """Whether each corridor shares a point with each box.
+    """Whether each corridor shares a point with each object at each sample.
 
-    Runs of segments and boxes are first compared as circles; the few pairs that are close are
-    collected and tested exactly, a fixed number at a time, until all are done.
+    Runs of segments (as circles) are first compared with the strips that the objects sweep in a
+    window of time; the few pairs that are close are collected and tested exactly, until all are
+    done.
 
     Args:
       axes: `[L, M]` corridors.
       half_width: m.
-      box: `[N]` boxes.
-      present: `[N]` bool, boxes that exist; the others hit nothing.
+      box: `[W, S, N]` boxes of N objects at S samples of W windows.
+      present: `[W, S, N]` bool, boxes that exist; the others hit nothing.
 
     Returns:
-      `[L, N]` bool.
+      `[W, L, S, N]` bool.
     """
-    num_boxes = box.x.shape[0]
-    pieces = jax.vmap(_segments, (0, None))(axes, half_width)
-    spare = -pieces.used.shape[1] % BLOCK
-    pieces = jax.tree.map(lambda v: jnp.pad(v, ((0, 0), (0, spare))), pieces)
-    blocks = _blocks(axes, pieces, half_width)
-    reach = jnp.hypot(box.half_length, box.half_width)
-    dx = blocks.x[..., None] - box.x
-    dy = blocks.y[..., None] - box.y
-    limit = blocks.radius[..., None] + reach
-    # A little slack: rounding must not lose a touching pair.
-    near = (dx * dx + dy * dy <= limit * limit * 1.0001) & present
-    near &= (blocks.radius > 0)[..., None]
-    # First the boxes that are near anything, then their (path, run) pairs.
-    boxes = prefix_count(jnp.any(near, axis=(0, 1)))
-    lane = jnp.arange(BLOCK)
-    num_paths, num_blocks = near.shape[:2]
+    pieces = jax.tree.map(_pad_to_blocks, jax.vmap(_segments, (0, None))(axes, half_width))
+    # A wedge lies within half a width of a rectangle's end, hence inside the same circle.
+    reach = jnp.hypot(pieces.box.half_length, pieces.box.half_width)
+    blocks = _blocks(pieces.box.x, pieces.box.y, reach, pieces.used)
+    table = _table(pieces)
+    num_paths, (num_samples, num_objects) = axes.x.shape[0], present.shape[1:]
+    sample = jnp.arange(num_samples, dtype=jnp.int32)[:, None]
 
-    def some_boxes(carry):
-        chunk, hit = carry
-        number = chunk * BOXES + jnp.arange(BOXES, dtype=jnp.int32)
-        row = nth_true(boxes, number + 1)
-        close = near[:, :, row] & (number < boxes[-1])
-        pairs = prefix_count(close.reshape(-1))
+    def window(given):
+        box, present = given
+        size = jnp.max(jnp.hypot(box.half_length, box.half_width), axis=0)
+        near = _blocks_near(blocks, _strips(box, present), size)
+        boxes = jnp.stack(box)
 
-        def some_pairs(carry):
-            part, hit = carry
-            wanted = part * PAIRS + jnp.arange(PAIRS, dtype=jnp.int32)
-            index = nth_true(pairs, wanted + 1)
-            path, block, column = jnp.unravel_index(index, (num_paths, num_blocks, BOXES))
-            segment = block[:, None] * BLOCK + lane
-            piece = jax.tree.map(lambda v: v[path[:, None], segment], pieces)
-            target = jax.tree.map(lambda v: v[row[column]][:, None], box)
-            touch = jnp.any(_piece_meets_box(piece, target), axis=1) & (wanted < pairs[-1])
-            where = jnp.where(touch, path * num_boxes + row[column], hit.shape[0])
-            return part + 1, hit.at[where].set(True, mode="drop")
+        def visit(path, run, item, real, hit):
+            here, target = table.run(path, run), Box(*boxes[:, :, item])
 
-        _, hit = jax.lax.while_loop(
-            lambda carry: carry[0] * PAIRS < pairs[-1], some_pairs, (jnp.int32(0), hit)
-        )
-        return chunk + 1, hit
+            def one_segment(i, touched):
+                return touched | _piece_meets_box(table.unpack(here[:, i]), target)
 
-    start = (jnp.int32(0), jnp.zeros(num_paths * num_boxes, bool))
-    _, hit = jax.lax.while_loop(lambda carry: carry[0] * BOXES < boxes[-1], some_boxes, start)
-    return hit.reshape(num_paths, num_boxes)
+            none = jnp.zeros((num_samples, PAIRS), bool)
+            touched = jax.lax.fori_loop(0, BLOCK, one_segment, none)
+            touched &= real & present[:, item]
+            where = (path * num_samples + sample) * num_objects + item
+            return hit.at[jnp.where(touched, where, hit.shape[0])].set(True, mode="drop")
+
+        hit = _for_pairs(near, visit, jnp.zeros(num_paths * num_samples * num_objects, bool))
+        return hit.reshape(num_paths, num_samples, num_objects)
+
+    return jax.lax.map(window, (box, present))
+
+
+def project_where(paths: Path, half_width: jax.Array, box: Box, wanted: jax.Array) -> jax.Array:
+    """`geometry.project` of box centres onto several paths, where the corridors hit the boxes.
+
+    Args:
+      paths: `[L, M]` paths.
+      half_width: of the corridors, m; a wanted box touches its corridor.
+      box: `[W, S, N]` boxes.
+      wanted: `[W, L, S, N]` bool.
+
+    Returns:
+      `[W, L, S, N]` arc lengths, 0 where not wanted.
+    """
+    index = jnp.arange(paths.x.shape[1] - 1)
+    used = index < jnp.maximum(paths.count - 1, 1)[:, None]
+    ax, ay, bx, by = paths.x[:, :-1], paths.y[:, :-1], paths.x[:, 1:], paths.y[:, 1:]
+    begin = paths.progress[:, :-1]
+    end = jnp.where(index + 1 < paths.count[:, None], paths.progress[:, 1:], begin)
+    reach = 0.5 * jnp.hypot(bx - ax, by - ay) + 1e-3
+    blocks = _blocks(*(_pad_to_blocks(v) for v in (0.5 * (ax + bx), 0.5 * (ay + by), reach, used)))
+    table = _table(jax.tree.map(_pad_to_blocks, (ax, ay, bx, by, begin, end, used)))
+    num_samples, num_objects = wanted.shape[2:]
+    sample = jnp.arange(num_samples, dtype=jnp.int32)[:, None]
+
+    def window(given):
+        box, wanted = given
+        size = jnp.max(jnp.hypot(box.half_length, box.half_width), axis=0)
+        # From a centre to the corridor, and from there to the path, in the corner of a cap at most.
+        margin = size + 1.5 * half_width
+        near = _blocks_near(blocks, _strips(box, jnp.any(wanted, axis=0)), margin)
+        near &= jnp.any(wanted, axis=1)[:, None]
+        flat = wanted.reshape(-1)
+        nowhere = flat.shape[0]
+
+        def visit(path, run, item, real, carry):
+            least, progress = carry
+            px, py = box.x[:, item], box.y[:, item]
+            here = table.run(path, run)
+
+            def one_segment(i, best):
+                x0, y0, x1, y1, s0, s1, used = table.unpack(here[:, i])
+                square, t = point_segment_sq(px, py, x0, y0, x1, y1)
+                closer = (square < best[0]) & used
+                at = s0 + t * (s1 - s0)
+                return jnp.where(closer, square, best[0]), jnp.where(closer, at, best[1])
+
+            start = (jnp.full_like(px, jnp.inf), jnp.zeros_like(px))
+            square, at = jax.lax.fori_loop(0, BLOCK, one_segment, start)
+            where = (path * num_samples + sample) * num_objects + item
+            where = jnp.where(flat[where] & real, where, nowhere)
+            closer = least.at[where].min(square, mode="drop")
+            progress = jnp.where(closer < least, jnp.inf, progress)
+            # Of equally near points the first on the path counts.
+            best = square == closer[jnp.minimum(where, nowhere - 1)]
+            progress = progress.at[jnp.where(best, where, nowhere)].min(at, mode="drop")
+            return closer, progress
+
+        far = jnp.full(flat.shape, jnp.inf, box.x.dtype)
+        _, progress = _for_pairs(near, visit, (far, far))
+        return jnp.where(wanted, progress.reshape(wanted.shape), 0)
+
+    return jax.lax.map(window, (box, wanted))
 
 
 def corridor_hits_lights(axis: Corridor, half_width: jax.Array, red: RedLights) -> jax.Array:
@@ -294,34 +432,3 @@ def object_boxes(forecast: AgentForecast) -> Box:
         jnp.broadcast_to(0.5 * forecast.length, heading.shape),
         jnp.broadcast_to(0.5 * forecast.width, heading.shape),
     )
-
-
-def project_where(paths: Path, px: jax.Array, py: jax.Array, wanted: jax.Array) -> jax.Array:
-    """`geometry.project` onto several paths, only where asked.
-
-    Args:
-      paths: `[L, M]` paths.
-      px: `[N]` points.
-      py: `[N]`.
-      wanted: `[L, N]` bool.
-
-    Returns:
-      `[L, N]` arc lengths, 0 where not asked.
-    """
-    num = px.shape[0]
-    flat = wanted.reshape(-1)
-    counts = prefix_count(flat)
-
-    def some_points(carry):
-        chunk, out = carry
-        number = chunk * POINTS + jnp.arange(POINTS, dtype=jnp.int32)
-        index = nth_true(counts, number + 1)
-        path, row = index // num, index % num
-        one = lambda p, x, y: project(jax.tree.map(lambda v: v[p], paths), x, y)
-        progress = jax.vmap(one)(path, px[row], py[row])
-        where = jnp.where(number < counts[-1], index, out.shape[0])
-        return chunk + 1, out.at[where].set(progress, mode="drop")
-
-    start = (jnp.int32(0), jnp.zeros(flat.shape, px.dtype))
-    _, out = jax.lax.while_loop(lambda carry: carry[0] * POINTS < counts[-1], some_points, start)
-    return out.reshape(wanted.shape)

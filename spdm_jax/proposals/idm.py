@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from spdm_jax.agents.observation import RedLights, ego_inside
@@ -27,6 +28,8 @@ from spdm_jax.proposals.corridor import (
 from spdm_jax.types import AgentForecast
 
 IDM_EXPONENT = 10
+WINDOW = 21
+"""Forecast samples whose corridor contents are found together."""
 PLAN_SECONDS = 8.0
 """Length of the driving corridor at the highest target speed, s (tuplan_garage)."""
 
@@ -127,16 +130,20 @@ def corridor_contents(
 
     Source: tuplan_garage `PDMGenerator._initialize_proposals`, `_update_leading_agents`.
     """
-    boxes = object_boxes(forecast)
     half_width = jnp.asarray(0.5 * vehicle.width, paths.x.dtype)
-    present = (forecast.sample_valid & forecast.valid[:, None]).T
     reach = max_speed * PLAN_SECONDS
     axes = jax.vmap(lambda path, begin: corridor_axis(path, begin, begin + reach))(paths, start)
+    present = (forecast.sample_valid & forecast.valid[:, None]).T
+    boxes = jax.tree.map(_in_windows, object_boxes(forecast))
 
-    flat = jax.tree.map(lambda v: v.reshape(-1), boxes)
+    # In short windows of time an object sweeps little of the road.
+    hit = corridors_hit_boxes(axes, half_width, boxes, _in_windows(present))
+    progress = project_where(paths, half_width, boxes, hit)
     shape = (start.shape[0], *present.shape)
-    hit = corridors_hit_boxes(axes, half_width, flat, present.reshape(-1)).reshape(shape)
-    progress = project_where(paths, flat.x, flat.y, hit.reshape(shape[0], -1)).reshape(shape)
+    hit, progress = (
+        jnp.moveaxis(v, 0, 1).reshape(shape[0], -1, shape[2])[:, : shape[1]]
+        for v in (hit, progress)
+    )
 
     num_lights = red.valid.shape[0]
 
@@ -159,6 +166,13 @@ def corridor_contents(
         progress=jnp.concatenate([progress, over_time(light_progress)], axis=2),
         rank=jnp.arange(shape[2] + num_lights, dtype=jnp.int32),
     )
+
+
+def _in_windows(values: jax.Array) -> jax.Array:
+    """`[S, N]` samples in `[W, WINDOW, N]` windows, the last one filled with the last sample."""
+    num = values.shape[0]
+    index = np.minimum(np.arange(-(-num // WINDOW) * WINDOW), num - 1)
+    return values[index].reshape(-1, WINDOW, values.shape[1])
 
 
 class _Search(NamedTuple):
@@ -273,9 +287,11 @@ def _with_leaks(found: _Found, path_length: jax.Array, vehicle: VehicleParams) -
     free = found.index < 0
     writes_speed = ~free & ~found.is_light
     order = jnp.arange(free.shape[1])
-    last = jax.lax.cummax(jnp.where(writes_speed, order, -1), axis=1)
+    # [L, policy, policy before or the same]: few policies, so comparing them all is cheapest.
+    before = order[None, :] <= order[:, None]
+    last = jnp.max(jnp.where(before & writes_speed[:, None], order, -1), axis=2)
     speed = jnp.take_along_axis(found.speed, jnp.maximum(last, 0), axis=1)
-    any_free = jax.lax.cummax(free.astype(jnp.int32), axis=1) > 0
+    any_free = jnp.any(before & free[:, None], axis=2)
     return Leader(
         progress=jnp.where(free, path_length[:, None], found.progress),
         speed=jnp.where(last >= 0, speed, 0),

@@ -1,5 +1,6 @@
 """From sub-scores to the PDM score."""
 
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ def aggregate(
     comfort: jax.Array,
     valid: jax.Array,
     params: ScoringParams,
+    xp: ModuleType = jnp,
 ) -> Aggregate:
     """Normalises progress over the valid proposals and combines the terms.
 
@@ -32,16 +34,17 @@ def aggregate(
       comfort: `[P]` 0 or 1.
       valid: `[P]` bool; the others do not enter the normalisation and score 0.
       params: weights.
+      xp: array module; NumPy for sub-scores that are on the host already.
 
     Source: tuplan_garage `PDMScorer._aggregate_scores`: score = m (5 progress + 5 ttc + 2
     comfort) / 12; where nobody's m x progress exceeds 0.1 m, progress is 1 if m is not 0.
     """
-    multiplier = jnp.where(valid, multiplier, 0)
+    multiplier = xp.where(valid, multiplier, 0)
     weighted = progress_raw * multiplier
-    best = jnp.max(weighted)
+    best = xp.max(weighted)
     moved = best > params.progress_threshold
-    relative = weighted / jnp.where(moved, best, 1)
-    progress = jnp.where(moved, relative, jnp.where(multiplier != 0, 1.0, 0.0))
+    relative = weighted / xp.where(moved, best, 1)
+    progress = xp.where(moved, relative, xp.where(multiplier != 0, 1.0, 0.0))
     weights = params.progress_weight + params.ttc_weight + params.comfort_weight
     total = (
         multiplier

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spdm_jax.arrays import true_indices
+from spdm_jax.arrays import nth_true, true_entries, true_indices
 from spdm_jax.config import DT, ScoringParams, VehicleParams
-from spdm_jax.geometry import Box, boxes_overlap, ego_box
+from spdm_jax.geometry import Box, box_at, boxes_overlap, ego_box
 from spdm_jax.scoring.areas import EgoAreas
 from spdm_jax.types import AgentForecast, CollisionKind, EgoState
 
@@ -178,22 +178,114 @@ def _is_behind(cos: jax.Array, params: ScoringParams) -> jax.Array:
     return behind
 
 
+# Contacts judged together.
+_PAIRS = 256
+
+
+def _judge(touched: jax.Array, violates, columns: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """First violation of each proposal among the pairs that touch.
+
+    Few pairs touch: they are collected and judged a fixed number at a time, until all are done.
+
+    Args:
+      touched: `[P, A]` bool.
+      violates: called with proposal and object `[N]`; returns the time index of the contact, and
+        whether it is a violation and which penalty (the lowest counts) it gets.
+      columns: time indices, T.
+
+    Returns:
+      `[P]` time index (T if none), object (-1 if none) and lowest penalty (1 if none).
+    """
+    num, num_objects = touched.shape
+    entries = true_entries(touched.reshape(-1))
+    never = jnp.int32(columns * num_objects)
+
+    def some(carry):
+        part, key, lowest = carry
+        number = part * _PAIRS + jnp.arange(_PAIRS, dtype=jnp.int32)
+        row, column = jnp.divmod(nth_true(entries, number + 1), num_objects)
+        time, violation, penalty = violates(row, column)
+        row = jnp.where(violation & (number < entries.total), row, num)
+        # Equal times are resolved by the object's number.
+        key = key.at[row].min(time * num_objects + column, mode="drop")
+        return part + 1, key, lowest.at[row].min(penalty, mode="drop")
+
+    more = lambda carry: carry[0] * _PAIRS < entries.total
+    start = (jnp.int32(0), jnp.full(num, never), jnp.ones(num, jnp.float32))
+    _, key, lowest = jax.lax.while_loop(more, some, start)
+    hit = key < never
+    time = jnp.where(hit, key // num_objects, columns)
+    return time, jnp.where(hit, key % num_objects, -1), lowest
+
+
 class CollisionResult(NamedTuple):
-    """Outcome of the at-fault collision rule.
+    """Outcome of the at-fault collision rule, `[P]` each.
 
     Attributes:
-      score: `[P]` 0 (agent), 0.5 (static object) or 1.
-      time_index: `[P]` int32 of the first at-fault contact, T if none.
-      object: `[P]` int32 forecast row, -1 if none.
-      kind: `[P]` int32 `CollisionKind`, -1 if none.
-      pair_kind: `[P, A]` int32 kind of each pair's first contact, -1 if they never touch.
+      score: 0 (agent), 0.5 (static object) or 1.
+      time_index: int32 of the first at-fault contact, T if none.
+      object: int32 forecast row, -1 if none.
+      kind: int32 `CollisionKind`, -1 if none.
     """
 
     score: jax.Array
     time_index: jax.Array
     object: jax.Array
     kind: jax.Array
-    pair_kind: jax.Array
+
+
+def collision_kind(
+    ego: EgoState,
+    forecast: AgentForecast,
+    proposal: jax.Array,
+    item: jax.Array,
+    time: jax.Array,
+    vehicle: VehicleParams,
+    params: ScoringParams,
+) -> jax.Array:
+    """`CollisionKind` of contacts, int32 `[...]`.
+
+    Args:
+      ego: tracked proposals `[P, T]`.
+      forecast: objects `[A, S]`.
+      proposal: `[...]` rows of `ego`.
+      item: `[...]` rows of `forecast`.
+      time: `[...]` time index of the contact.
+      vehicle: ego dimensions.
+      params: thresholds.
+
+    Source: nuPlan `get_collision_type`.
+    """
+    at = lambda values: values[proposal, time]
+    x, y, heading = at(ego.x), at(ego.y), at(ego.heading)
+    speed = jnp.hypot(at(ego.vx), at(ego.vy))
+    sample = time // 2
+    other = box_at(
+        forecast.x[item, sample],
+        forecast.y[item, sample],
+        forecast.heading[item, sample],
+        0.5 * forecast.length[item],
+        0.5 * forecast.width[item],
+    )
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    front = vehicle.rear_axle_to_center + 0.5 * vehicle.length
+    bumper = Box(
+        x + front * cos,
+        y + front * sin,
+        cos,
+        sin,
+        jnp.zeros((), x.dtype),
+        jnp.asarray(0.5 * vehicle.width, x.dtype),
+    )
+    behind = _is_behind(_cos_to_object(x, y, heading, other.x, other.y), params)
+    stopped_track = ~forecast.is_agent[item] | (forecast.speed[item] <= params.stopped_speed)
+    kind = jnp.where(
+        boxes_overlap(bumper, other), CollisionKind.ACTIVE_FRONT, CollisionKind.ACTIVE_LATERAL
+    )
+    kind = jnp.where(behind, CollisionKind.ACTIVE_REAR, kind)
+    kind = jnp.where(stopped_track, CollisionKind.STOPPED_TRACK, kind)
+    kind = jnp.where(speed <= params.stopped_speed, CollisionKind.STOPPED_EGO, kind)
+    return kind.astype(jnp.int32)
 
 
 def no_at_fault_collision(
@@ -213,88 +305,32 @@ def no_at_fault_collision(
     `get_collision_type`; differs: closed-form separating axes instead of shapely.
     """
     steps = ego.x.shape[1]
-    touched = contacts.time < steps
-    t = jnp.minimum(contacts.time, steps - 1)
+    out_of_lane = areas.multiple_lanes | areas.non_drivable
 
-    def at(values):
-        return jnp.take_along_axis(values, t, axis=1)
+    def violates(proposal, item):
+        time = jnp.minimum(contacts.time[proposal, item], steps - 1)
+        kind = collision_kind(ego, forecast, proposal, item, time, vehicle, params)
+        at_fault = (
+            (kind == CollisionKind.STOPPED_TRACK)
+            | (kind == CollisionKind.ACTIVE_FRONT)
+            | ((kind == CollisionKind.ACTIVE_LATERAL) & out_of_lane[proposal, time])
+        )
+        return time, at_fault, jnp.where(forecast.is_agent[item], 0.0, 0.5).astype(jnp.float32)
 
-    x, y, heading = at(ego.x), at(ego.y), at(ego.heading)
-    speed = jnp.hypot(at(ego.vx), at(ego.vy))
-    box = ego_box(ego, vehicle)
-    row = jnp.arange(forecast.x.shape[0])
-    sample = t // 2
-    other = Box(
-        forecast.x[row, sample],
-        forecast.y[row, sample],
-        jnp.cos(forecast.heading[row, sample]),
-        jnp.sin(forecast.heading[row, sample]),
-        0.5 * forecast.length,
-        0.5 * forecast.width,
-    )
-    cos, sin = at(box.cos), at(box.sin)
-    bumper = Box(
-        at(box.x) + box.half_length * cos,
-        at(box.y) + box.half_length * sin,
-        cos,
-        sin,
-        jnp.zeros_like(box.half_length),
-        box.half_width,
-    )
-    behind = _is_behind(_cos_to_object(x, y, heading, other.x, other.y), params)
-    stopped_track = ~forecast.is_agent | (forecast.speed <= params.stopped_speed)
-    kind = jnp.where(
-        speed <= params.stopped_speed,
-        CollisionKind.STOPPED_EGO,
-        jnp.where(
-            stopped_track,
-            CollisionKind.STOPPED_TRACK,
-            jnp.where(
-                behind,
-                CollisionKind.ACTIVE_REAR,
-                jnp.where(
-                    boxes_overlap(bumper, other),
-                    CollisionKind.ACTIVE_FRONT,
-                    CollisionKind.ACTIVE_LATERAL,
-                ),
-            ),
-        ),
-    ).astype(jnp.int32)
-    out_of_lane = at(areas.multiple_lanes | areas.non_drivable)
-    at_fault = touched & (
-        (kind == CollisionKind.STOPPED_TRACK)
-        | (kind == CollisionKind.ACTIVE_FRONT)
-        | ((kind == CollisionKind.ACTIVE_LATERAL) & out_of_lane)
-    )
-    penalty = jnp.where(forecast.is_agent, 0.0, 0.5).astype(ego.x.dtype)
-    score = jnp.min(jnp.where(at_fault, penalty, 1.0), axis=1, initial=1.0)
-    time = jnp.where(at_fault, contacts.time, steps)
-    first, who = _first(time, steps)
-    hit = first < steps
-    return CollisionResult(
-        score=score.astype(ego.x.dtype),
-        time_index=first,
-        object=jnp.where(hit, who, -1),
-        kind=jnp.where(hit, jnp.take_along_axis(kind, who[:, None], 1)[:, 0], -1),
-        pair_kind=jnp.where(touched, kind, -1),
-    )
-
-
-def _first(time: jax.Array, never: int) -> tuple[jax.Array, jax.Array]:
-    """Smallest entry of each row of `[P, A]` and its column; `never` and 0 where A is 0."""
-    if time.shape[1] == 0:
-        empty = jnp.zeros(time.shape[0], jnp.int32)
-        return empty + never, empty
-    return jnp.min(time, axis=1), jnp.argmin(time, axis=1).astype(jnp.int32)
+    time, item, score = _judge(contacts.time < steps, violates, steps)
+    hit = item >= 0
+    row, first = jnp.arange(ego.x.shape[0]), jnp.minimum(time, steps - 1)
+    kind = collision_kind(ego, forecast, row, jnp.maximum(item, 0), first, vehicle, params)
+    return CollisionResult(score.astype(ego.x.dtype), time, item, jnp.where(hit, kind, -1))
 
 
 class TTCResult(NamedTuple):
-    """Outcome of the time-to-collision rule.
+    """Outcome of the time-to-collision rule, `[P]` each.
 
     Attributes:
-      score: `[P]` 0 or 1.
-      time_index: `[P]` int32 of the first violation, T if none.
-      object: `[P]` int32 forecast row, -1 if none.
+      score: 0 or 1.
+      time_index: int32 of the first violation, T if none.
+      object: int32 forecast row, -1 if none.
     """
 
     score: jax.Array
@@ -327,25 +363,17 @@ def time_to_collision(
     """
     steps = ego.x.shape[1]
     never = steps * _NUM_AHEAD
-    touched = contacts.ttc < never
-    key = jnp.minimum(contacts.ttc, never - 1)
-    t = key // _NUM_AHEAD
-    ahead = jnp.asarray(LOOK_AHEAD, jnp.int32)[key % _NUM_AHEAD]
-    sample = (t + ahead) // 2
-    row = jnp.arange(forecast.x.shape[0])
+    exposed = areas.multiple_lanes | areas.non_drivable | in_intersection
 
-    def at(values):
-        return jnp.take_along_axis(values, t, axis=1)
+    def violates(proposal, item):
+        key = jnp.minimum(contacts.ttc[proposal, item], never - 1)
+        time = key // _NUM_AHEAD
+        sample = (time + jnp.asarray(LOOK_AHEAD, jnp.int32)[key % _NUM_AHEAD]) // 2
+        at = lambda values: values[proposal, time]
+        x, y = forecast.x[item, sample], forecast.y[item, sample]
+        cos = _cos_to_object(at(ego.x), at(ego.y), at(ego.heading), x, y)
+        violation = _is_ahead(cos, params) | (at(exposed) & ~_is_behind(cos, params))
+        return time, violation, jnp.where(violation, 0.0, 1.0).astype(jnp.float32)
 
-    cos = _cos_to_object(
-        at(ego.x), at(ego.y), at(ego.heading), forecast.x[row, sample], forecast.y[row, sample]
-    )
-    exposed = at(areas.multiple_lanes | areas.non_drivable | in_intersection)
-    violation = touched & (_is_ahead(cos, params) | (exposed & ~_is_behind(cos, params)))
-    first, who = _first(jnp.where(violation, t, steps), steps)
-    hit = first < steps
-    return TTCResult(
-        score=jnp.where(hit, 0.0, 1.0).astype(ego.x.dtype),
-        time_index=first,
-        object=jnp.where(hit, who, -1),
-    )
+    time, item, score = _judge(contacts.ttc < never, violates, steps)
+    return TTCResult(score.astype(ego.x.dtype), time, item)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from spdm_jax.arrays import prefix_sum
 from spdm_jax.config import ScoringParams
-from spdm_jax.geometry import Path, project
+from spdm_jax.geometry import Path, project_many
 
 
 def driving_direction(
@@ -40,6 +40,6 @@ def progress(path: Path, center_x: jax.Array, center_y: jax.Array) -> jax.Array:
 
     Source: tuplan_garage `PDMScorer._calculate_progress`.
     """
-    start = project(path, center_x[..., 0], center_y[..., 0])
-    end = project(path, center_x[..., -1], center_y[..., -1])
+    ends = lambda v: jnp.concatenate([v[:, 0], v[:, -1]])
+    start, end = jnp.split(project_many(path, ends(center_x), ends(center_y)), 2)
     return jnp.maximum(end - start, 0)

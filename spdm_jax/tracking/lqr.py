@@ -13,6 +13,7 @@ from spdm_jax.types import EgoState
 
 HORIZON = 10
 """Steps of the lateral controller's look-ahead."""
+_CARRIED = ("x", "y", "heading", "vx", "ax", "steering", "steering_rate")
 
 # Sums over the look-ahead steps i = 0..9 at speeds v + b i (b = dt x acceleration). T_i = dt (v +
 # b i) is the distance of step i; see `_lateral_command`.
@@ -87,8 +88,8 @@ def _lateral_command(e, psi, delta, v, accel, moments, params: TrackerParams):
     return -(qe * b_e * z_e + qp * b_psi * z_psi + qd * b_delta * z_delta) / gain
 
 
-def _command(state, reference, params: TrackerParams):
-    """Acceleration and steering-rate command of one step, `[P]` each."""
+def _command(state, reference, params: TrackerParams, axis: int = 0):
+    """Acceleration and steering-rate command, `[P]` each; `axis` is that of the moments."""
     v, v_ref = state.vx, reference["speed"]
     error = v - v_ref
     horizon = DT * HORIZON
@@ -97,7 +98,8 @@ def _command(state, reference, params: TrackerParams):
     dx, dy = state.x - reference["x"], state.y - reference["y"]
     e = -dx * reference["sin"] + dy * reference["cos"]
     psi = wrap(state.heading - reference["heading"])
-    rate = _lateral_command(e, psi, state.steering, v, accel, reference["moments"], params)
+    moments = [jnp.take(reference["moments"], i, axis=axis) for i in range(len(_MOMENTS))]
+    rate = _lateral_command(e, psi, state.steering, v, accel, moments, params)
     stopping = (v_ref <= params.stopping_speed) & (v <= params.stopping_speed)
     accel = jnp.where(stopping, -params.stopping_gain * error, accel)
     return accel, jnp.where(stopping, 0, rate)
@@ -153,16 +155,18 @@ def reference_at(
     """What the controller reads at each step, time first: `[T - 1, P]`, moments `[T - 1, 5, P]`."""
     speed, curvature = reference_profiles(x, y, heading, tracker)
     steps = speed.shape[-1]
-    windows = jnp.asarray(_window_matrix(steps), x.dtype)
-    moments = jnp.einsum("mkj,pj->kmp", windows, curvature, precision=jax.lax.Precision.HIGHEST)
+    windows = np.swapaxes(_window_matrix(steps), 0, 1).reshape(-1, steps).astype(x.dtype)
+    moments = jnp.matmul(windows, curvature.T, precision=jax.lax.Precision.HIGHEST)
+    moments = moments.reshape(steps, len(_MOMENTS), -1)
+    x, y, heading, speed = x.T[:-1], y.T[:-1], heading.T[:-1], speed.T
     target = np.minimum(np.arange(steps) + HORIZON, steps - 1)
     return {
-        "x": x[:, :-1].T,
-        "y": y[:, :-1].T,
-        "heading": heading[:, :-1].T,
-        "cos": jnp.cos(heading[:, :-1]).T,
-        "sin": jnp.sin(heading[:, :-1]).T,
-        "speed": speed[:, target].T,
+        "x": x,
+        "y": y,
+        "heading": heading,
+        "cos": jnp.cos(heading),
+        "sin": jnp.sin(heading),
+        "speed": speed[target],
         "moments": moments,
     }
 
@@ -197,11 +201,25 @@ def track(
     reference = reference_at(x, y, heading, tracker)
     start = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v, x.dtype), (num,)), initial)
 
+    # What follows from other fields is left to the end: a scan pays for every array it carries.
     def step(state, ref):
-        accel, rate = _command(state, ref, params)
-        following = bicycle_step(state, accel, rate, vehicle, params)
-        return following, (following, jnp.stack([accel, rate], -1))
+        now = start.replace(**state)
+        accel, rate = _command(now, ref, params)
+        following = bicycle_step(now, accel, rate, vehicle, params)
+        after = {name: getattr(following, name) for name in _CARRIED}
+        return after, after
 
-    _, (states, commands) = jax.lax.scan(step, start, reference)
-    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]).T, start, states)
-    return states, jnp.moveaxis(commands, 0, 1)
+    _, after = jax.lax.scan(step, {name: getattr(start, name) for name in _CARRIED}, reference)
+    yaw_rate = after["vx"] * jnp.tan(after["steering"]) / vehicle.wheel_base
+    before = jnp.concatenate([start.yaw_rate[None], yaw_rate[:-1]])
+    zero = jnp.zeros_like(yaw_rate)
+    after = EgoState(
+        **after,
+        vy=zero,
+        ay=zero,
+        yaw_rate=yaw_rate,
+        yaw_acceleration=(yaw_rate - before) / DT,
+    )
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, after)
+    commands = _command(jax.tree.map(lambda v: v[:-1], states), reference, params, axis=1)
+    return jax.tree.map(jnp.transpose, states), jnp.stack([c.T for c in commands], -1)

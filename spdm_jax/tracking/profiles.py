@@ -45,11 +45,11 @@ def speed_fit_matrix(num_steps: int, tracker: Tracker) -> np.ndarray:
 
 def speed_profile(x: jax.Array, y: jax.Array, heading: jax.Array, tracker: Tracker) -> jax.Array:
     """Fits speeds `[P, N]` (m/s) to poses `[P, N + 1]`."""
-    dx, dy = jnp.diff(x, axis=-1), jnp.diff(y, axis=-1)
-    start = heading[..., :-1]
-    along = dx * jnp.cos(start) + dy * jnp.sin(start)
-    matrix = jnp.asarray(speed_fit_matrix(along.shape[-1], tracker), x.dtype)
-    return jnp.matmul(along, matrix.T, precision=jax.lax.Precision.HIGHEST)
+    # Time first: that is how the tracker reads it, and long axes last keep loops contiguous.
+    x, y, start = x.T, y.T, heading.T[:-1]
+    along = jnp.diff(x, axis=0) * jnp.cos(start) + jnp.diff(y, axis=0) * jnp.sin(start)
+    matrix = jnp.asarray(speed_fit_matrix(along.shape[0], tracker), x.dtype)
+    return jnp.matmul(matrix, along, precision=jax.lax.Precision.HIGHEST).T
 
 
 def curvature_profile(heading: jax.Array, speed: jax.Array) -> jax.Array:
@@ -62,11 +62,11 @@ def curvature_profile(heading: jax.Array, speed: jax.Array) -> jax.Array:
     Source: tuplan_garage `batch_lqr_utils._fit_initial_curvature_and_curvature_rate_profile`.
     """
     coupling = CURVATURE_RATE_PENALTY / DT**2
-    step = speed * DT
-    turn = wrap(jnp.diff(heading, axis=-1))
-    information = jnp.moveaxis(step * step, -1, 0) / coupling
-    moment = jnp.moveaxis(step * turn, -1, 0) / coupling
-    information = information.at[0].add(INITIAL_CURVATURE_PENALTY / coupling)
+    step = speed.T * DT
+    turn = wrap(jnp.diff(heading.T, axis=0))
+    first = jnp.arange(step.shape[0])[:, None] == 0
+    information = (step * step + jnp.where(first, INITIAL_CURVATURE_PENALTY, 0)) / coupling
+    moment = step * turn / coupling
 
     def forward(carry, xs):
         p, r = carry
@@ -84,4 +84,4 @@ def curvature_profile(heading: jax.Array, speed: jax.Array) -> jax.Array:
         return k, k
 
     _, rest = jax.lax.scan(backward, last, (p[:-1], r[:-1]), reverse=True)
-    return jnp.moveaxis(jnp.concatenate([rest, last[None]]), 0, -1)
+    return jnp.concatenate([rest, last[None]]).T

@@ -24,8 +24,7 @@ from spdm_jax.geometry import ego_box, interpolate
 from spdm_jax.proposals import idm
 from spdm_jax.proposals.lanes import parallel_path
 from spdm_jax.scoring.aggregate import aggregate
-from spdm_jax.scoring.areas import EgoAreas
-from spdm_jax.scoring.collision import first_contacts, no_at_fault_collision
+from spdm_jax.scoring.collision import collision_kind, first_contacts
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import reference_profiles, track
 
@@ -334,7 +333,7 @@ def check_scene(path: FilePath, report, dtype) -> None:
         robust_areas=robust_areas,
         tolerance=state_tol,
     )
-    _compare_events(report, name, simulated, scored, world, params, data, robust)
+    _compare_events(report, name, simulated, world, params, data, robust)
     combined = aggregate(
         jnp.asarray(np.prod(data["multi_metrics"], 0), dtype),
         jnp.asarray(data["progress_raw"], dtype),
@@ -428,19 +427,21 @@ def _compare_states(report, name, array, ours, reference, tolerance, mask=None):
     report.close(name, f"{array} heading", ours[..., 2], reference[..., 2], tolerance, mask, True)
 
 
-def _compare_events(report, name, simulated, scored, world, params, data, robust):
+def _compare_events(report, name, simulated, world, params, data, robust):
     """First contact of each proposal and object: time and kind."""
     contacts = first_contacts(simulated, world.forecast, world.vehicle, params.scoring)
-    flags = EgoAreas(scored.multiple_lanes, scored.non_drivable, scored.oncoming)
-    result = no_at_fault_collision(
-        simulated, flags, world.forecast, contacts, world.vehicle, params.scoring
+    num, steps = simulated.x.shape
+    row, item = np.indices(contacts.time.shape)
+    when = jnp.minimum(contacts.time, steps - 1)
+    kinds = collision_kind(
+        simulated, world.forecast, row, item, when, world.vehicle, params.scoring
     )
-    num = simulated.x.shape[0]
+    kinds = np.where(np.asarray(contacts.time) < steps, kinds, -1)
     first = np.full((num, world.num_objects, 2), -1)
     for proposal, time, index, kind, *_ in np.asarray(data["collision_events"]).astype(int)[::-1]:
         first[proposal, index] = time, kind
     time = np.asarray(contacts.time)[:, : world.num_objects]
-    kind = np.asarray(result.pair_kind)[:, : world.num_objects]
+    kind = kinds[:, : world.num_objects]
     time = np.where(time < simulated.x.shape[1], time, -1)
     report.equal(name, "first contacts", np.stack([time, kind], -1), first, robust[:, None, None])
 

@@ -25,13 +25,12 @@ from spdm_jax.geometry import (
 from spdm_jax.proposals.idm import Leader, at_policies, idm_step
 from spdm_jax.proposals.lanes import parallel_path
 from spdm_jax.scoring.aggregate import aggregate
-from spdm_jax.scoring.areas import EgoAreas, containing_polygons
+from spdm_jax.scoring.areas import containing_polygons
 from spdm_jax.scoring.collision import (
-    Contacts,
     _cos_to_object,
     _is_ahead,
     _is_behind,
-    no_at_fault_collision,
+    collision_kind,
 )
 from spdm_jax.scoring.comfort import comfort_flags, comfort_signals
 from spdm_jax.scoring.driving import driving_direction
@@ -322,11 +321,8 @@ def _geometry(name, d, report, dtype, tol):
 
     def kind_of(state, agents):
         one = jax.tree.map(lambda v: v[None, None], state)
-        none = jnp.zeros((1, 1), bool)
-        contacts = Contacts(jnp.zeros((1, 1), jnp.int32), jnp.zeros((1, 1), jnp.int32))
-        return no_at_fault_collision(
-            one, EgoAreas(none, none, none), agents, contacts, params.vehicle, params.scoring
-        ).pair_kind[0, 0]
+        first = jnp.int32(0)
+        return collision_kind(one, agents, first, first, first, params.vehicle, params.scoring)
 
     report.equal(
         name, "collision_type", jax.vmap(kind_of)(ego, forecast), d["collision_type"], robust

@@ -20,14 +20,23 @@ from spdm_jax.proposals.corridor import (
 from spdm_jax.types import LightStatus, Polygons
 
 HALF_WIDTH = 1.1485
-NUM_PATHS, NUM_POINTS, NUM_BOXES = 3, 40, 200
+NUM_PATHS, NUM_POINTS, NUM_BOXES, NUM_SAMPLES = 3, 40, 200, 5
 # GEOS drops vertices of the line that lie within 1 % of the width of it, and a round join of
 # several chords counts as a circle here: shapes agree up to this much.
 SLACK = 0.015
 seeds = st.integers(0, 2**32 - 1)
 
 _axes = jax.jit(jax.vmap(corridor_axis))
-_hit = jax.jit(corridors_hit_boxes)
+
+
+@jax.jit
+def _hit(axes, half_width, box, present):
+    """Every box as an object of its own at a single sample."""
+    one_sample = jax.tree.map(lambda v: v[None, None], (box, present))
+    return corridors_hit_boxes(axes, half_width, *one_sample)[0, :, 0]
+
+
+_hit_all = jax.jit(corridors_hit_boxes)
 _lights = jax.jit(jax.vmap(corridor_hits_lights, (0, None, None)))
 _project_where, _project = jax.jit(project_where), jax.jit(jax.vmap(project, (0, None, None)))
 
@@ -132,14 +141,34 @@ def test_many_hits_are_all_found():
     np.testing.assert_array_equal(hit, np.broadcast_to(side == 0, hit.shape))
 
 
+@settings(max_examples=20)
 @given(seeds)
-def test_wanted_projections_equal_plain_ones(seed: int):
+def test_moving_objects_are_found_at_every_sample(seed: int):
+    """Objects that sweep some road, seen together and sample by sample."""
     rng = np.random.default_rng(seed)
-    _, paths = random_lines(rng, 0.5)
-    points = jnp.asarray(rng.normal(0, 20, (2, NUM_BOXES)))
-    wanted = rng.random((NUM_PATHS, NUM_BOXES)) < rng.choice([0.0, 0.1, 1.0])
-    found = np.asarray(_project_where(paths, *points, jnp.asarray(wanted)))
-    np.testing.assert_allclose(found, np.where(wanted, _project(paths, *points), 0), atol=1e-9)
+    lines, paths = random_lines(rng, 0.2)
+    box, _ = random_boxes(rng, lines)
+    way = rng.normal(0, 4, (2, NUM_BOXES)) * (rng.random(NUM_BOXES) < 0.7)
+    steps = np.arange(NUM_SAMPLES)[:, None]
+    moved = Box(
+        box.x + steps * way[0],
+        box.y + steps * way[1],
+        *(jnp.stack([v] * NUM_SAMPLES) for v in box[2:]),
+    )
+    present = jnp.asarray(rng.random((NUM_SAMPLES, NUM_BOXES)) < 0.9)
+    axes = _axes(paths, jnp.zeros(NUM_PATHS), jnp.asarray(paths.length))
+    half_width = jnp.asarray(HALF_WIDTH)
+    window = jax.tree.map(lambda v: v[None], moved)
+    found = _hit_all(axes, half_width, window, present[None])
+    at = np.asarray(_project_where(paths, half_width, window, found))[0]
+    together = np.asarray(found)[0]
+    for sample in range(NUM_SAMPLES):
+        here = Box(*(v[sample] for v in moved))
+        alone = np.asarray(_hit(axes, half_width, here, present[sample]))
+        np.testing.assert_array_equal(together[:, sample], alone)
+        plain = np.where(alone, _project(paths, here.x, here.y), 0)
+        np.testing.assert_allclose(at[:, sample], plain, atol=1e-9)
+    assert together.any() and not together.all()
 
 
 def lights_of(shapes: list[shapely.Polygon]) -> RedLights:
