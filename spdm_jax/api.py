@@ -5,18 +5,18 @@ functions underneath are in `spdm_jax.functional`.
 """
 
 from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from spdm_jax import planner as planning
 from spdm_jax.agents.forecast import ForecastPoses
+from spdm_jax.batching import BatchConfig, Precision, SceneRunner
 from spdm_jax.config import (
     NUM_FORECAST,
     PlannerConfig,
@@ -31,9 +31,10 @@ from spdm_jax.io.build import build_scenario, start_at
 from spdm_jax.io.crop import MapIndex
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
-from spdm_jax.padding import PaddingConfig, batch, bucket, to_device
+from spdm_jax.padding import PaddingConfig, batch, bucket
 from spdm_jax.proposals.lanes import area_masks, drivable_lanes
 from spdm_jax.results import Failure, PlanSet, ScenarioSet, ScoreSet
+from spdm_jax.scoring.aggregate import aggregate
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import track
 from spdm_jax.trajectories import (
@@ -46,9 +47,8 @@ from spdm_jax.trajectories import (
     to_local,
     untracked_states,
 )
-from spdm_jax.types import EgoState, Scenario, ScenarioInfo
+from spdm_jax.types import Array, EgoState, Scenario, ScenarioInfo, SubScores
 
-Precision = Literal["f32", "f64"]
 _PATH_BUCKETS = (256, 512, 1024, 2048, 4096)
 
 
@@ -156,15 +156,6 @@ def _collect(
     return ScenarioSet(stacked, infos, failures)
 
 
-def _precision(precision: Precision):
-    """dtype, and the context in which JAX may use it."""
-    if precision == "f64":
-        return jnp.float64, jax.enable_x64(True)
-    if precision == "f32":
-        return jnp.float32, nullcontext()
-    raise ValueError(f"precision is {precision!r}; it must be 'f32' or 'f64'")
-
-
 def fit_config(scenes: ScenarioSet, config: PlannerConfig) -> PlannerConfig:
     """Gives paths just the room that the longest lane sequence of the set needs."""
     route, count = scenes.batch.route, np.asarray(scenes.batch.map.lanes.centerline.count)
@@ -180,7 +171,7 @@ def fit_config(scenes: ScenarioSet, config: PlannerConfig) -> PlannerConfig:
     return replace(config, max_path_points=bucket(needed, _PATH_BUCKETS))
 
 
-def _forecast_poses(forecast, scenes: ScenarioSet, dtype) -> ForecastPoses | None:
+def _forecast_poses(forecast, scenes: ScenarioSet) -> ForecastPoses | None:
     if forecast is None:
         return None
     values = np.asarray(forecast, np.float64)
@@ -193,23 +184,11 @@ def _forecast_poses(forecast, scenes: ScenarioSet, dtype) -> ForecastPoses | Non
         )
     valid = np.all(np.isfinite(values), axis=-1)
     clean = np.where(valid[..., None], values, 0.0)
-    return ForecastPoses(
-        *(jnp.asarray(clean[..., i], dtype) for i in range(3)), valid=jnp.asarray(valid)
-    )
+    return ForecastPoses(*(clean[..., i] for i in range(3)), valid=valid)
 
 
-@partial(jax.jit, static_argnames=("config",))
-def _plan_batch(batch, params, forecast, config):
-    # One scene after the other: on a CPU a plain vmap over scenes is slower, and the results do
-    # not depend on the neighbours.
-    def one(args):
-        return planning.plan(args[0], params, config, args[1])
-
-    return jax.lax.map(one, (batch, forecast))
-
-
-def _to_numpy(tree):
-    return jax.tree.map(np.asarray, tree)
+def _plan_one(scene, forecast, params, config):
+    return planning.plan(scene, params, config, forecast)
 
 
 def plan(
@@ -218,6 +197,7 @@ def plan(
     *,
     precision: Precision = "f32",
     forecast=None,
+    batching: BatchConfig | None = None,
 ) -> PlanSet:
     """Plans once in every scene, at iteration 0.
 
@@ -226,18 +206,15 @@ def plan(
       planner: `spdm(...)` or `pdm_closed(...)`; SPDM with 60 proposals if None.
       precision: "f32", or "f64" for comparisons with a reference.
       forecast: `[B, A, 41, 3]` supplied forecast instead of the planner's own.
+      batching: how scenes are spread over cores and devices.
 
     Returns:
       `PlanSet` with NumPy leaves.
     """
     planner = planner or spdm()
-    dtype, context = _precision(precision)
     config = fit_config(scenes, planner.config)
-    with context:
-        device = to_device(scenes.batch, dtype).replace(origin=jnp.zeros((len(scenes), 2), dtype))
-        params = cast_params(planner.params, dtype)
-        poses = _forecast_poses(forecast, scenes, dtype)
-        result = _to_numpy(_plan_batch(device, params, poses, config=config))
+    run = SceneRunner(_plan_one, config, precision=precision, config=batching)
+    result = run(scenes.batch, _forecast_poses(forecast, scenes), planner.params)
     return PlanSet(
         scores=result.scores,
         tracked=result.tracked,
@@ -258,6 +235,7 @@ def score_scene(
     *,
     tracker: bool,
     forecast: ForecastPoses | None = None,
+    valid: Array | None = None,
 ):
     """Scores trajectories `[P, 41]` in one scene at iteration 0 (pure).
 
@@ -268,6 +246,7 @@ def score_scene(
       config: static settings; `config.tracker` picks the tracker's fit.
       tracker: whether to track the poses with the LQR.
       forecast: supplied forecast for all tracks, or None.
+      valid: `[P]` bool, trajectories that count; all if None.
 
     Returns:
       `SubScores`, the driven `EgoState` `[P, 41]`, the `AgentForecast` and the overflow flag.
@@ -286,18 +265,92 @@ def score_scene(
         pose = (states.x, states.y, states.heading)
         states, _ = track(*pose, given.ego, params.vehicle, params.tracker, config.tracker)
     world = World(scene.map.grid, masks, seen.forecast, path)
-    valid = jnp.ones(states.x.shape[0], bool)
-    scores = score_trajectories(states, valid, world, params.vehicle, params.scoring)
+    counts = jnp.ones(states.x.shape[0], bool) if valid is None else jnp.asarray(valid)
+    scores = score_trajectories(states, counts, world, params.vehicle, params.scoring)
     return scores, states, seen.forecast, state.overflow | seen.red.overflow
 
 
-@partial(jax.jit, static_argnames=("config", "tracker"))
-def _score_batch(batch, states, params, forecast, config, tracker):
-    def one(args):
-        scene, mine, poses = args
-        return score_scene(scene, mine, params, config, tracker=tracker, forecast=poses)
+BLOCK_SIZES = (16, 64, 256, 1024)
+"""Proposals scored by one program, padded to the next size; more are scored block by block. The
+sizes bound what has to fit into a processor's cache, and how many programs there are."""
 
-    return jax.lax.map(one, (batch, states, forecast))
+
+class _Block(struct.PyTreeNode):
+    """Part of a scene's trajectories: columns `[P, 41]`, `[P]` bool, and a supplied forecast."""
+
+    columns: dict[str, Array]
+    valid: Array
+    forecast: ForecastPoses | None
+
+
+def _score_block(scene: Scenario, block: _Block, params: PlannerParams, static):
+    config, tracks = static
+    rest = jnp.zeros_like(block.columns["x"])
+    return score_scene(
+        scene,
+        EgoState(**{name: block.columns.get(name, rest) for name in STATE_COLUMNS}),
+        params,
+        config,
+        tracker=tracks,
+        forecast=block.forecast,
+        valid=block.valid,
+    )
+
+
+def _score_in_blocks(
+    scenes: ScenarioSet,
+    columns: dict[str, np.ndarray],
+    forecast: ForecastPoses | None,
+    params: PlannerParams,
+    run: SceneRunner,
+):
+    """Scores columns `[B, P, 41]` of states; returns what `score_scene` returns, `[B, P, ...]`."""
+    total, count = columns["x"].shape[:2]
+    size = bucket(min(count, BLOCK_SIZES[-1]), BLOCK_SIZES)
+    parts = -(-count // size)
+    spare = parts * size - count
+
+    def split(values: np.ndarray) -> np.ndarray:
+        # Rows beyond the last one repeat it: finite, and not valid.
+        if spare:
+            values = np.concatenate([values, np.repeat(values[:, -1:], spare, axis=1)], axis=1)
+        return values.reshape(total * parts, size, *values.shape[2:])
+
+    valid = np.broadcast_to(np.arange(parts * size) < count, (total, parts * size))
+    scene_of = np.repeat(np.arange(total), parts)
+    blocks = _Block(
+        columns=jax.tree.map(split, columns),
+        valid=valid.reshape(total * parts, size),
+        forecast=jax.tree.map(lambda values: values[scene_of], forecast),
+    )
+    found = run(scenes.batch, blocks, params, scene_of=scene_of)
+    join = lambda v: v.reshape(total, parts * size, *v.shape[2:])[:, :count]
+    scores, tracked = (jax.tree.map(join, tree) for tree in found[:2])
+    first = lambda v: v.reshape(total, parts, *v.shape[1:])[:, 0]
+    seen, overflow = (jax.tree.map(first, tree) for tree in found[2:])
+    if parts > 1:
+        scores = _aggregate_anew(scores, params)
+    return scores, tracked, seen, overflow
+
+
+def _aggregate_anew(scores: SubScores, params: PlannerParams) -> SubScores:
+    """Progress and total relative to all proposals of a scene, not those of a block."""
+    dtype = scores.progress_raw.dtype
+    weights = jax.tree.map(lambda value: np.asarray(value, dtype), params.scoring)
+    multiplier = scores.no_at_fault_collision * scores.drivable_area * scores.driving_direction
+    rows = zip(
+        multiplier,
+        scores.progress_raw,
+        scores.time_to_collision,
+        scores.comfort,
+        scores.valid,
+        strict=True,
+    )
+    combined = [aggregate(*row, weights, xp=np) for row in rows]
+    return scores.replace(
+        progress=np.stack([c.progress for c in combined]),
+        total=np.stack([c.total for c in combined]),
+    )
 
 
 def score(
@@ -311,6 +364,7 @@ def score(
     params: PlannerParams | None = None,
     precision: Precision = "f32",
     forecast=None,
+    batching: BatchConfig | None = None,
 ) -> ScoreSet:
     """Scores any trajectories with the PDM score.
 
@@ -329,6 +383,7 @@ def score(
       params: weights, thresholds, vehicle.
       precision: "f32" or "f64".
       forecast: `[B, A, 41, 3]` supplied forecast instead of the configured one.
+      batching: how scenes are spread over cores and devices.
 
     Returns:
       `ScoreSet` with NumPy leaves `[B, P]`.
@@ -350,27 +405,14 @@ def score(
     origin = np.asarray(scenes.batch.origin)
     local = to_local(resample(to_ego(values, frame, ego_pose, origin), dt), "ego", ego_pose, origin)
     full = values.shape[-1] == len(STATE_COLUMNS)
-    if not full:
-        local = (
-            untracked_states(local, current)
-            if tracker == "none"
-            else np.concatenate([local, np.zeros((*local.shape[:-1], 8))], axis=-1)
-        )
-    dtype, context = _precision(precision)
-    with context:
-        device = to_device(scenes.batch, dtype).replace(origin=jnp.zeros((len(scenes), 2), dtype))
-        states = EgoState(
-            **{name: jnp.asarray(local[..., i], dtype) for i, name in enumerate(STATE_COLUMNS)}
-        )
-        result = _score_batch(
-            device,
-            states,
-            cast_params(params or PlannerParams(), dtype),
-            _forecast_poses(forecast, scenes, dtype),
-            config=config,
-            tracker=not full and tracker != "none",
-        )
-    scores, tracked, seen, overflow = _to_numpy(result)
+    if tracker == "none" and not full:
+        local = untracked_states(local, current)
+    columns = {STATE_COLUMNS[i]: local[..., i] for i in range(local.shape[-1])}
+    tracks = not full and tracker != "none"
+    run = SceneRunner(_score_block, (config, tracks), precision=precision, config=batching)
+    scores, tracked, seen, overflow = _score_in_blocks(
+        scenes, columns, _forecast_poses(forecast, scenes), params or PlannerParams(), run
+    )
     return ScoreSet(
         scores=scores,
         tracked=tracked,

@@ -74,8 +74,12 @@ def default_folder() -> Path:
 
 
 def machine_fingerprint() -> str:
-    """Returns a name for what a cached program depends on: processor features and JAX version."""
-    features = [platform.machine(), platform.processor()]
+    """Returns a name for what a cached program depends on: processor, JAX and package version."""
+    # A new version of this package starts anew: see `spdm_jax.programs`, which cannot store what
+    # JAX finds in its cache.
+    from spdm_jax import __version__
+
+    features = [platform.machine(), platform.processor(), __version__]
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
         wanted = ("model name", "flags", "Features", "CPU implementer", "CPU part")

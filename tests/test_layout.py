@@ -30,6 +30,8 @@ ALLOWED = {
     "geometry": {"types", "config", "arrays"},
     "padding": {"types", "config", "schema", "geometry"},
     "compile_cache": set[str](),
+    "programs": set[str](),
+    "batching": {"types", "schema", "padding", "programs"},
     "io": BASE,
     "synthetic": BASE | {"io"},
     "proposals": STAGES,
@@ -40,12 +42,15 @@ ALLOWED = {
     "planner": STAGES | {"decision"},
     "trajectories": {"types", "config"},
     "results": {"types", "config", "planner"},
+    "nested": STAGES | {"decision", "planner"},
+    "vocabulary": {"types", "config", "trajectories"},
+    "labels": set[str](),
     "viz": STAGES | {"io", "planner", "results"},
     "simulation": STAGES | {"planner"},
     "metrics": STAGES | {"planner", "simulation"},
 }
 # Faces of the library: they may use every part, and no part may use them.
-FACES = {"__init__", "api", "functional", "testing"}
+FACES = {"__init__", "api", "functional", "testing", "torch_bridge", "soft"}
 NO_JAX = ("io", "synthetic")
 LAZY = ("matplotlib", "polars", "pyproj", "yaml", "tyro")
 
