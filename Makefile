@@ -47,5 +47,5 @@ $(INSTALLED): pyproject.toml
 	@$(PY) -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv --clear .venv || { \
 	  echo "$(PYTHON) cannot create .venv; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 	@echo "Installing the project into .venv (once, a few minutes) ..."
-	@$(PY) -m pip install -qq --no-compile --disable-pip-version-check -e ".[data,plot,dev]"
+	@$(PY) -m pip install -qq --no-compile --disable-pip-version-check -e ".[data,plot,cluster,dev]"
 	@touch $(INSTALLED)

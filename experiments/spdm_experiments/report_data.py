@@ -1,0 +1,344 @@
+"""Run folders of `spdm sweep` as numbers: means, bootstrap intervals, paired differences.
+
+Failed scenarios are counted and never averaged in. Everything is deterministic for a seed.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import polars
+
+from spdm_experiments.report_grid import frozen, varied
+
+TERMS: Final = {
+    "total": "Total score",
+    "no_at_fault_collision": "No at-fault collision",
+    "drivable_area": "Drivable area",
+    "driving_direction": "Driving direction",
+    "progress": "Progress",
+    "time_to_collision": "Time to collision",
+    "comfort": "Comfort",
+}
+SHORT: Final = dict(zip(TERMS, ("Score", "NC", "DAC", "DDC", "EP", "TTC", "C"), strict=True))
+METRES: Final = "progress_raw"
+"""Progress in metres, the one mean that is no score."""
+
+RESAMPLES: Final = 2000
+TIE: Final = 1e-4
+"""Totals of one scenario that differ by less count as equal: float32 on two devices does."""
+_BLOCK = 4_000_000  # numbers of one block of resamples
+_FORMAT = 1
+_NEEDED = ("token", "point", "planner", "num_proposals", "status", "reason", *TERMS, METRES)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder.
+
+    Attributes:
+      folder: where it lies.
+      about: run.json.
+      rows: one row per (scenario, grid point), ordered by point and token.
+      stages: times of stages per number of proposals, or None.
+    """
+
+    folder: Path
+    about: Mapping[str, Any]
+    rows: polars.DataFrame
+    stages: polars.DataFrame | None
+
+    @property
+    def points(self) -> list[dict[str, Any]]:
+        """Grid points; the place of one is its number in the rows."""
+        return self.about["points"]
+
+    @property
+    def missing(self) -> int:
+        """Scenarios that lack rows still, at all grid points or at some."""
+        rows = self.rows.group_by("token").len()
+        whole = int((rows["len"] == len(self.points)).sum())
+        return max(0, self.about["num_scenarios"] - whole)
+
+    def usable(self, point: int) -> polars.DataFrame:
+        """Rows of a grid point that have scores, ordered by token."""
+        return self.rows.filter((polars.col("point") == point) & (polars.col("status") == "ok"))
+
+
+@dataclass(frozen=True)
+class PointSummary:
+    """One grid point over all its scenarios.
+
+    Attributes:
+      point: number of the grid point.
+      scenarios: scenarios with scores.
+      failed: scenarios without.
+      means: of every term and of the progress in metres; NaN without any scenario.
+      intervals: 95 % bootstrap intervals of those means; NaN below two scenarios.
+      braking: share of scenarios with an emergency brake.
+      ms: mean run time per scenario, compilation apart.
+    """
+
+    point: int
+    scenarios: int
+    failed: int
+    means: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    braking: float
+    ms: float
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """Total scores of one grid point in two runs, first minus second, scenario by scenario.
+
+    Attributes:
+      points: number of the grid point in each run.
+      scenarios: scenarios that have scores in both.
+      mean: mean difference.
+      interval: its 95 % bootstrap interval.
+      wins: scenarios in which the first run is better; `losses`: worse; `ties`: equal.
+    """
+
+    points: tuple[int, int]
+    scenarios: int
+    mean: float
+    interval: tuple[float, float]
+    wins: int
+    ties: int
+    losses: int
+
+
+def load_run(folder: Path) -> Run:
+    """Reads a run folder, finished or not.
+
+    Args:
+      folder: written by `spdm sweep`.
+
+    Raises:
+      ValueError: it is no such folder, has no rows yet, or holds a scenario twice.
+    """
+    about = _read_about(folder)
+    parts = sorted((folder / "rows").glob("part-*.parquet"))
+    if not parts:
+        raise ValueError(
+            f"{folder}: no rows/part-*.parquet yet, so there is nothing to report; run the same "
+            "spdm sweep command until its first chunk is finished"
+        )
+    frames = [_read_parquet(path) for path in parts]
+    for path, frame in zip(parts, frames, strict=True):
+        if lacking := [name for name in _NEEDED if name not in frame.columns]:
+            raise ValueError(
+                f"{path}: no column {lacking[0]!r}; the file is of another program or version, "
+                "sweep into another folder"
+            )
+    rows = polars.concat(frames, how="diagonal_relaxed").sort("point", "token")
+    twice = rows.filter(polars.struct("point", "token").is_duplicated())
+    if len(twice):
+        raise ValueError(
+            f"{folder}: scenario {twice['token'][0]!r} occurs twice at grid point "
+            f"{twice['point'][0]}; two sweeps wrote into one folder, sweep into another one"
+        )
+    stages = folder / "stages.parquet"
+    return Run(folder, about, rows, _read_parquet(stages) if stages.exists() else None)
+
+
+def _read_about(folder: Path) -> dict[str, Any]:
+    path = folder / "run.json"
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder; name one that spdm sweep has written")
+    if not path.is_file():
+        raise ValueError(f"{folder}: no run.json, so no run folder; name one of spdm sweep")
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not valid JSON ({error}); sweep again") from error
+    command = about.get("command") if isinstance(about, dict) else None
+    if command != "sweep":
+        raise ValueError(
+            f"{path}: written by spdm {command}; spdm report reads what spdm sweep has written"
+            if command
+            else f"{path}: does not say that spdm sweep wrote it; name a folder of spdm sweep"
+        )
+    if about.get("format") != _FORMAT:
+        raise ValueError(
+            f"{path}: format is {about.get('format')!r}, this version reads {_FORMAT}; report with "
+            "the version that swept, or sweep again"
+        )
+    for name in ("points", "num_scenarios"):
+        if name not in about:
+            raise ValueError(f"{path}: no field {name!r}; sweep again")
+    return about
+
+
+def _read_parquet(path: Path) -> polars.DataFrame:
+    try:
+        return polars.read_parquet(path)
+    except polars.exceptions.PolarsError as error:
+        raise ValueError(f"{path}: damaged ({error}); delete it and sweep again") from error
+
+
+# ---- means and intervals ----
+
+
+def bootstrap(values: np.ndarray, seed: int) -> np.ndarray:
+    """Returns 95 % intervals of the means over rows: percentiles of means of resampled rows.
+
+    All columns see the same resamples.
+
+    Args:
+      values: `[N, K]`.
+      seed: of the resamples.
+
+    Returns:
+      `[2, K]` lower and upper ends; NaN if N < 2, which tells nothing of the spread.
+    """
+    count, columns = values.shape
+    if count < 2:
+        return np.full((2, columns), np.nan)
+    generator = np.random.default_rng(seed)
+    means = np.empty((RESAMPLES, columns))
+    step = max(1, _BLOCK // count)
+    for start in range(0, RESAMPLES, step):
+        size = min(step, RESAMPLES - start)
+        picked = generator.integers(0, count, (size, count))
+        picked += count * np.arange(size)[:, None]
+        # How often each row was drawn, so that a matrix product gives all columns' means.
+        drawn = np.bincount(picked.ravel(), minlength=size * count).reshape(size, count)
+        means[start : start + size] = drawn @ values / count
+    return np.quantile(means, (0.025, 0.975), axis=0)
+
+
+def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
+    """Returns one summary per grid point; scenarios that failed are counted only."""
+    names = [*TERMS, METRES]
+    found = []
+    for point in range(len(run.points)):
+        good = run.usable(point)
+        values = good.select(polars.col(names).cast(polars.Float64)).to_numpy()
+        ends = [(low, high) for low, high in bootstrap(values, seed).T.tolist()]
+        means = values.mean(axis=0) if len(values) else np.full(len(names), np.nan)
+        found.append(
+            PointSummary(
+                point=point,
+                scenarios=len(good),
+                failed=len(run.rows.filter(polars.col("point") == point)) - len(good),
+                means=dict(zip(names, means.tolist(), strict=True)),
+                intervals=dict(zip(names, ends, strict=True)),
+                braking=_mean(good, "emergency_brake"),
+                ms=_mean(good, "run_ms"),
+            )
+        )
+    return found
+
+
+def _mean(frame: polars.DataFrame, column: str) -> float:
+    """Mean of a column, NaN where there is none."""
+    if column not in frame.columns:
+        return float("nan")
+    value = frame[column].cast(polars.Float64).mean()
+    return float("nan") if value is None else float(value)  # pyright: ignore[reportArgumentType]
+
+
+def common_points(first: Run, second: Run) -> list[tuple[int, int]]:
+    """Returns the grid points that two runs share, as pairs of numbers.
+
+    Planner, number of proposals and what either run varies must agree. A setting that each run
+    holds fixed may differ: it is then what the runs compare.
+    """
+    keys = {"planner", "num_proposals", *varied(first.points), *varied(second.points)}
+    identity = lambda point: tuple(frozen(point.get(key)) for key in sorted(keys))
+    places = {identity(point): number for number, point in enumerate(second.points)}
+    return [
+        (number, places[identity(point)])
+        for number, point in enumerate(first.points)
+        if identity(point) in places
+    ]
+
+
+def pair_up(first: Run, second: Run, points: tuple[int, int]) -> polars.DataFrame:
+    """Returns the scenarios with scores in both runs: token, total, other, difference."""
+    left, right = first.usable(points[0]), second.usable(points[1])
+    total = polars.col("total").cast(polars.Float64)
+    return (
+        left.with_columns(total)
+        .join(right.select("token", other=total), on="token")
+        .with_columns(difference=polars.col("total") - polars.col("other"))
+        .sort("token")
+    )
+
+
+def paired_difference(
+    first: Run, second: Run, points: tuple[int, int], seed: int = 0
+) -> PairedDifference:
+    """Compares one grid point of two runs over the scenarios that both have scores of."""
+    change = pair_up(first, second, points)["difference"].to_numpy()
+    low, high = bootstrap(change[:, None], seed)[:, 0].tolist()
+    wins, losses = int((change > TIE).sum()), int((change < -TIE).sum())
+    return PairedDifference(
+        points=points,
+        scenarios=len(change),
+        mean=float(change.mean()) if len(change) else float("nan"),
+        interval=(low, high),
+        wins=wins,
+        ties=len(change) - wins - losses,
+        losses=losses,
+    )
+
+
+# ---- single scenes ----
+
+
+def worst(run: Run, point: int, count: int) -> polars.DataFrame:
+    """Returns the rows of the lowest totals of a grid point, lowest first."""
+    return run.usable(point).sort("total", "token").head(count)
+
+
+def largest_losses(
+    first: Run, second: Run, points: tuple[int, int], count: int
+) -> polars.DataFrame:
+    """Returns the rows in which the first run falls furthest behind the second, worst first."""
+    found = pair_up(first, second, points).filter(polars.col("difference") < -TIE)
+    return found.sort("difference", "token").head(count)
+
+
+def first_lost(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns the first term that the chosen proposal lost, and the reason; empty if none.
+
+    The order is that of the rules: what sets the total to zero comes first.
+    """
+    if row["no_at_fault_collision"] < 1:
+        return "no_at_fault_collision", "at-fault collision" + _blame(row, "collision")
+    if row["drivable_area"] < 1:
+        return "drivable_area", "a corner leaves the drivable area"
+    if row["driving_direction"] < 1:
+        return "driving_direction", "drives off the route's lanes or against traffic"
+    if row["time_to_collision"] < 1:
+        return "time_to_collision", "less than 1 s to a collision" + _blame(row, "ttc")
+    if row["comfort"] < 1:
+        return "comfort", "uncomfortable: acceleration, jerk or yaw beyond the bounds"
+    if row["progress"] < 1 - 1e-6:
+        share = 100 * row["progress"]
+        return "progress", f"{row[METRES]:.1f} m, {share:.0f} % of the best admissible proposal"
+    return "", ""
+
+
+def _blame(row: Mapping[str, Any], kind: str) -> str:
+    """Says with whom and when, as far as the row knows."""
+    agent, time = row.get(f"{kind}_agent"), row.get(f"{kind}_time")
+    text = f" with {agent}" if agent else ""
+    return text + (f" at {time:.1f} s" if time is not None and np.isfinite(time) else "")
+
+
+def failures(run: Run) -> list[dict[str, Any]]:
+    """Returns the failed scenarios: token, status, reason, and at how many grid points."""
+    bad = run.rows.filter(polars.col("status") != "ok")
+    return (
+        bad.group_by("token", "status", "reason")
+        .agg(points=polars.len())
+        .sort("token", "status", "reason")
+        .to_dicts()
+    )

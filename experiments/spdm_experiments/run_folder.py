@@ -1,0 +1,285 @@
+"""The folder of a sweep: described once, filled part by part, never changed afterwards.
+
+    RUN/run.json                 # what is computed; every later start is compared with it
+    RUN/rows/part-*.parquet      # one per finished chunk
+    RUN/trajectories/part-*.npz  # on request
+    RUN/progress-*.json          # times and counts of the processes that worked on it
+
+Every file appears whole, by rename, and a part of rows is the last thing written of its chunk: what
+has rows is done, whatever stopped the process before.
+"""
+
+import io
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars
+
+from spdm_experiments.inventory import Shard
+from spdm_jax.io.scenario_file import write_atomically
+
+RUN = "run.json"
+ROWS = "rows"
+TRAJECTORIES = "trajectories"
+FORMAT = 1
+COMPARED = (
+    "format",
+    "command",
+    "precision",
+    "seed",
+    "config",
+    "points",
+    "num_scenarios",
+    "input_hash",
+    "versions",
+)
+"""Entries of run.json that must be the same for a run to go on."""
+NOTED = ("commit", "device")
+"""Entries whose change is only mentioned."""
+_SHOWN = 60  # characters of a value in an error text
+
+
+def open_run(folder: Path, about: Mapping[str, Any]) -> list[str]:
+    """Describes a new run, or checks that this is the one that the folder holds.
+
+    Args:
+      folder: made if absent.
+      about: run.json.
+
+    Returns:
+      What is different without consequence, in words.
+
+    Raises:
+      ValueError: the folder holds another run; names entry and both values.
+    """
+    path = folder / RUN
+    if not path.exists() and any((folder / ROWS).glob("part-*.parquet")):
+        raise ValueError(f"{folder}: has rows but no {RUN} that says of what; use another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    content = (json.dumps(about, indent=1) + "\n").encode()
+    notes = [] if not path.exists() and _create(path, content) else _compare(path, content)
+    for name in (ROWS, TRAJECTORIES) if about["config"]["trajectories"] else (ROWS,):
+        (folder / name).mkdir(exist_ok=True)
+    return notes
+
+
+def _compare(path: Path, content: bytes) -> list[str]:
+    """Compares a run.json with what this command would write; see `open_run`."""
+    try:
+        there = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not readable ({error}); use another --out") from error
+    if not isinstance(there, dict):
+        raise ValueError(f"{path}: does not describe a run; use another --out")
+    ours = json.loads(content)
+    for name in COMPARED:
+        found = _difference(name, there.get(name), ours.get(name))
+        if found:
+            where, old, new = found
+            raise ValueError(
+                f"{path} was made with {where} = {_short(old)}, this command says {_short(new)}. "
+                "Use another --out, or the options of that run"
+            )
+    return [
+        f"{name} was {there.get(name)}, is {ours.get(name)} for what is computed from here on"
+        for name in NOTED
+        if there.get(name) != ours.get(name)
+    ]
+
+
+def _create(path: Path, content: bytes) -> bool:
+    """Writes a file that is not there yet; False if another process was first."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    write_atomically(temporary, content)
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        return False
+    except OSError:  # a file system without hard links
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return True
+
+
+def _difference(where: str, old: Any, new: Any) -> tuple[str, Any, Any] | None:
+    """The first place where two JSON values differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in {**old, **new}:
+            found = _difference(f"{where}.{name}", old.get(name), new.get(name))
+            if found:
+                return found
+        return None
+    numbers = lambda v: isinstance(v, list) and all(isinstance(x, int | float) for x in v)
+    if isinstance(old, list) and isinstance(new, list) and not (numbers(old) and numbers(new)):
+        if len(old) != len(new):
+            return f"number of {where}", len(old), len(new)
+        for i, pair in enumerate(zip(old, new, strict=True)):
+            found = _difference(f"{where}[{i}]", *pair)
+            if found:
+                return found
+        return None
+    return None if old == new else (where, old, new)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+
+
+@contextmanager
+def alone(folder: Path, shard: Shard) -> Iterator[None]:
+    """Keeps a second process from working on the same scenarios; ends with the process.
+
+    Raises:
+      ValueError: another process does.
+    """
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system: up to the user
+        yield
+        return
+    kinds = {"all": fcntl.LOCK_EX if shard.count == 1 else fcntl.LOCK_SH}
+    if shard.count > 1:
+        kinds[shard.name] = fcntl.LOCK_EX
+    files = []
+    try:
+        for name, kind in kinds.items():
+            file = open(folder / f".lock-{name}", "w")
+            files.append(file)
+            try:
+                fcntl.flock(file, kind | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ValueError(
+                    f"{folder}: another process is at work on these scenarios; wait for it, or "
+                    "give each process its --shard"
+                ) from error
+            except OSError:  # a file system without locks
+                pass
+        yield
+    finally:
+        for file in files:
+            file.close()
+
+
+def clean(folder: Path, shard: Shard) -> None:
+    """Removes what a killed process of this shard left half done."""
+    mine = "part-*" if shard.count == 1 else f"part-{shard.name}-*"
+    for name in (ROWS, TRAJECTORIES):
+        for path in (folder / name).glob(f".{mine}.tmp"):
+            path.unlink(missing_ok=True)
+    for path in (folder / TRAJECTORIES).glob(f"{mine}.npz"):
+        if not (folder / ROWS / f"{path.stem}.parquet").exists():
+            path.unlink(missing_ok=True)
+
+
+def read_done(folder: Path, num_points: int) -> tuple[dict[str, bool], list[str]]:
+    """Reads which scenarios have rows.
+
+    A part that cannot be read is renamed, so that its scenarios are done again.
+
+    Args:
+      folder: of the run.
+      num_points: rows per scenario.
+
+    Returns:
+      Token -> whether all its rows are "ok", and what the user should know.
+
+    Raises:
+      ValueError: two parts hold the same scenario.
+    """
+    done: dict[str, bool] = {}
+    origin: dict[str, str] = {}
+    notes: list[str] = []
+    for path in sorted((folder / ROWS).glob("part-*.parquet")):
+        try:
+            part = polars.read_parquet(path, columns=["token", "point", "status"])
+            rows = part.group_by("token", maintain_order=True).agg(
+                polars.col("point").sort().alias("points"),
+                (polars.col("status") == "ok").all().alias("ok"),
+            )
+            if any(points != list(range(num_points)) for points in rows["points"].to_list()):
+                raise ValueError(f"not one row for each of {num_points} points")
+        except (polars.exceptions.PolarsError, OSError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            notes.append(f"{path}: not readable ({reason}); its scenarios are done again")
+            with suppress(FileNotFoundError):  # another shard was first
+                path.rename(path.with_suffix(".damaged"))
+            continue
+        for token, ok in zip(rows["token"], rows["ok"], strict=True):
+            if token in origin:
+                raise ValueError(
+                    f"{folder / ROWS}: {origin[token]} and {path.name} both hold scenario "
+                    f"{token!r}; delete one of them"
+                )
+            origin[token] = path.name
+            done[token] = ok
+    return done, notes
+
+
+def write_part(
+    folder: Path, name: str, rows: polars.DataFrame, poses: Mapping[str, np.ndarray] | None
+) -> None:
+    """Writes a finished chunk, its rows last.
+
+    Args:
+      folder: of the run.
+      name: of the part, without ending.
+      rows: one per scenario and point.
+      poses: arrays of the trajectories file, or None.
+    """
+    if poses is not None:
+        buffer = io.BytesIO()
+        arrays: dict[str, Any] = dict(poses)
+        np.savez_compressed(buffer, **arrays)
+        write_atomically(folder / TRAJECTORIES / f"{name}.npz", buffer.getvalue())
+    buffer = io.BytesIO()
+    rows.write_parquet(buffer)
+    write_atomically(folder / ROWS / f"{name}.parquet", buffer.getvalue())
+
+
+class Progress:
+    """What one process did in a run, in RUN/progress-SHARD.json, written anew after each chunk."""
+
+    def __init__(self, folder: Path, shard: Shard, about: Mapping[str, Any]):
+        """Takes over what earlier processes of this shard wrote.
+
+        Args:
+          folder: of the run.
+          shard: names the file.
+          about: device, commit and versions of this process.
+        """
+        self._path = folder / f"progress-{shard.name}.json"
+        self._session = {"started": now(), **about}
+        self._earlier: list[Any] = []
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            self._earlier = json.loads(self._path.read_text(encoding="utf-8"))["sessions"]
+
+    def save(self, counts: Mapping[str, Any], work: Mapping[str, Any]) -> None:
+        """Writes the file.
+
+        Args:
+          counts: of the shard: scenarios, done, failed, finished.
+          work: of this process: scenarios, programs, seconds, messages.
+        """
+        session = {**self._session, "ended": now(), **work}
+        content = {**counts, "sessions": [*self._earlier, session]}
+        write_atomically(self._path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def note(lines: Sequence[str]) -> None:
+    """Tells the user something on the error stream."""
+    for line in lines:
+        print(f"note: {line}", file=sys.stderr)
+
+
+def now() -> str:
+    """Returns the time as files hold it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
