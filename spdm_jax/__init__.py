@@ -4,10 +4,15 @@ __version__ = "0.1.0"
 
 from spdm_jax import functional
 from spdm_jax.api import from_raw, load, plan, score
+from spdm_jax.batching import BatchConfig
 from spdm_jax.config import PlannerConfig, PlannerParams, PlannerSpec, pdm_closed, spdm
+from spdm_jax.labels import open_labels
 from spdm_jax.results import Explanation, Failure, PlanSet, ScenarioSet, ScoreSet
+from spdm_jax.torch_bridge import TorchScorer, torch_score
+from spdm_jax.vocabulary import build_vocabulary
 
 __all__ = [
+    "BatchConfig",
     "Explanation",
     "Failure",
     "PlanSet",
@@ -16,11 +21,15 @@ __all__ = [
     "PlannerSpec",
     "ScenarioSet",
     "ScoreSet",
+    "TorchScorer",
+    "build_vocabulary",
     "from_raw",
     "functional",
     "load",
+    "open_labels",
     "pdm_closed",
     "plan",
     "score",
     "spdm",
+    "torch_score",
 ]

@@ -218,8 +218,8 @@ class SceneRunner:
 
         def run(row: int) -> Any:
             used = made.used[len(leaves) :]
-            own = [place(v[row], u) for v, u in zip(own_leaves, used, strict=False)]
             with x64(self.precision):  # a setting of the thread
+                own = [place(v[row], u) for v, u in zip(own_leaves, used, strict=False)]
                 found = made.call(
                     scene(int(scene_of[row])), jax.tree.unflatten(own_tree, own), shared
                 )

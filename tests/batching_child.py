@@ -52,6 +52,22 @@ def devices(what: str) -> dict:
     }
 
 
+def scaled(scene, mine, shared, static):
+    return mine["factor"] * scene.ego.x, shared["offset"] + scene.ego.y
+
+
+def double() -> dict:
+    """Double precision in a process that computes with single precision otherwise."""
+    scenes = from_raw([make_scene("straight"), make_scene("curve")])
+    mine, shared = {"factor": np.array([1 / 3, 1 / 7])}, {"offset": 1 / 9}
+    x, y = SceneRunner(scaled, precision="f64")(scenes.batch, mine, shared)
+    wanted = mine["factor"][:, None] * scenes.batch.ego.x, shared["offset"] + scenes.batch.ego.y
+    return {
+        "types": [str(x.dtype), str(y.dtype)],
+        "digits": max(float(np.abs(a - b).max()) for a, b in zip((x, y), wanted, strict=True)),
+    }
+
+
 def memory() -> dict:
     """Eight scenes on devices whose memory holds two at a time."""
     scenes = from_raw(make_scene("straight", seed) for seed in range(8))
@@ -95,7 +111,9 @@ def stored(static: str = "1.5") -> dict:
     return {"stored": found[0], "result": result.tolist()}
 
 
+MODES = {"devices": devices, "double": double, "memory": memory, "stored": stored}
+
 if __name__ == "__main__":
     enable_compile_cache()
     mode, *arguments = sys.argv[1:]
-    print(json.dumps({"devices": devices, "memory": memory, "stored": stored}[mode](*arguments)))
+    print(json.dumps(MODES[mode](*arguments)))

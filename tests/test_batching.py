@@ -171,6 +171,13 @@ def test_out_of_memory_halves_the_chunk():
     assert found["equal"] and found["chunk"] == 2
 
 
+def test_double_precision_needs_no_setting():
+    """Elsewhere in these tests 64-bit types are on for the whole process."""
+    found = child("double", 1, "off")
+    assert found["types"] == ["float64", "float64"]
+    assert found["digits"] < 1e-9
+
+
 def test_stored_programs_start_a_new_process(tmp_path: Path):
     first = child("stored", 1, tmp_path)
     assert not first["stored"]

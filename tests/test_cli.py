@@ -19,7 +19,7 @@ from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
 from spdm_jax.synthetic import SyntheticReader
 
-VERBS = ("demo", "doctor", "pack", "plan", "score", "show")
+VERBS = ("demo", "doctor", "label", "pack", "plan", "report", "score", "show", "sweep", "vocab")
 
 
 class BrokenReader:

@@ -52,7 +52,7 @@ ALLOWED = {
 # Faces of the library: they may use every part, and no part may use them.
 FACES = {"__init__", "api", "functional", "testing", "torch_bridge", "soft"}
 NO_JAX = ("io", "synthetic")
-LAZY = ("matplotlib", "polars", "pyproj", "yaml", "tyro")
+LAZY = ("matplotlib", "polars", "pyproj", "ray", "torch", "yaml", "tyro")
 
 
 def modules() -> Iterator[tuple[str, str, Path]]:

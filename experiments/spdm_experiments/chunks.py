@@ -132,6 +132,12 @@ def _longest_route(scenario: Scenario) -> int:
     return max((int(count[s].sum(axis=1).max()) for s in sequences if len(s)), default=0)
 
 
+def suite_name(source: Path, readers: Sequence[str]) -> str:
+    """Names the scenes of a run by what they are, so that no folder's name passes for a suite."""
+    kinds = {"synthetic": "built-in scenes", "nuplan": "nuPlan format", "av2": "Argoverse 2"}
+    return f"{source} ({', '.join(kinds.get(reader, reader) for reader in readers)})"
+
+
 def num_chunks(count: int, size: int) -> int:
     """Returns how many chunks `count` scenarios make.
 

@@ -4,6 +4,7 @@ JAX takes a second to import, so it is imported inside the verbs that compute: `
 mistyped options answer at once.
 """
 
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -11,7 +12,19 @@ from collections.abc import Sequence
 import tyro
 
 from spdm_experiments import commands
-from spdm_experiments.options import Demo, Doctor, Options, Pack, Plan, Score, Show
+from spdm_experiments.options import (
+    Demo,
+    Doctor,
+    Label,
+    Options,
+    Pack,
+    Plan,
+    Report,
+    Score,
+    Show,
+    Sweep,
+    Vocab,
+)
 
 EXIT_FAILED = 1
 """The command ran, and something in it failed (a scenario, a check)."""
@@ -38,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         resumes = isinstance(options, Pack) and not options.overwrite
         hint = "; the same command goes on where it stopped" if resumes else ""
+        if isinstance(options, Label | Sweep):
+            hint = f"; go on with: spdm {shlex.join(sys.argv[1:] if argv is None else argv)}"
         print(f"spdm: interrupted{hint}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (ValueError, OSError, ImportError) as error:
@@ -55,14 +70,22 @@ def run(options: Options) -> bool:
             return commands.demo(options)
         case Doctor():
             return commands.doctor(options)
+        case Label():
+            return commands.label(options)
         case Pack():
             return commands.pack(options)
         case Plan():
             return commands.plan(options)
+        case Report():
+            return commands.report(options)
         case Score():
             return commands.score(options)
         case Show():
             return commands.show(options)
+        case Sweep():
+            return commands.sweep(options)
+        case Vocab():
+            return commands.vocab(options)
 
 
 def _one_line(error: Exception) -> str:

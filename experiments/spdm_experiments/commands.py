@@ -8,7 +8,18 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spdm_experiments.options import Demo, Doctor, Pack, Plan, Score, Show
+from spdm_experiments.options import (
+    Demo,
+    Doctor,
+    Label,
+    Pack,
+    Plan,
+    Report,
+    Score,
+    Show,
+    Sweep,
+    Vocab,
+)
 
 if TYPE_CHECKING:
     from spdm_jax.io.pack import PackReport
@@ -96,3 +107,31 @@ def show(options: Show) -> bool:
     from spdm_experiments.runs import run_show
 
     return run_show(options)
+
+
+def sweep(options: Sweep) -> bool:
+    """Plans every scenario at every point of a grid; False if a scenario failed."""
+    from spdm_experiments.sweep import run_sweep
+
+    return run_sweep(options)
+
+
+def report(options: Report) -> bool:
+    """Writes a page, and figures, for one or two runs of `sweep`."""
+    from spdm_experiments.report import run_report
+
+    return run_report(options)
+
+
+def label(options: Label) -> bool:
+    """Scores one vocabulary in every scenario; False if a scenario failed."""
+    from spdm_experiments.label import run_label
+
+    return run_label(options)
+
+
+def vocab(options: Vocab) -> bool:
+    """Builds a vocabulary; False if a scenario failed."""
+    from spdm_experiments.vocabulary import run_build
+
+    return run_build(options)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 Format = Literal["auto", "nuplan", "av2", "synthetic"]
 PlannerName = Literal["spdm", "pdm-closed"]
@@ -191,4 +191,152 @@ class Show(Planner):
     """Picture to write."""
 
 
-Options = Demo | Doctor | Pack | Plan | Score | Show
+@dataclass(frozen=True, kw_only=True)
+class Sweep(Compute):
+    """Plan every scenario at every point of a grid of settings, write a row for each.
+
+    Each option below takes several values; the grid is their product. The same command goes on
+    where an interrupted one stopped, also after a kill. A scenario that fails is a row with its
+    reason; the exit code is then 1.
+    """
+
+    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
+    """A folder of scenario files (see spdm pack), or one file."""
+    grid: Path | None = None
+    """A TOML file with one or several grids; see docs/sweeps.md."""
+    planner: tuple[PlannerName, ...] = ()
+    """SPDM, the baseline PDM-Closed, or both."""
+    num_proposals: tuple[int, ...] = ()
+    """Proposals per scene: SPDM 15, 20, 25, ... (60 if left out); PDM-Closed 1, 3, 6, 15, 30 or 60
+    (15 if left out)."""
+    speeds: tuple[str, ...] = ()
+    """Target speeds as fractions of the speed limit, between commas: 0.2,0.4,0.6,0.8,1."""
+    offsets: tuple[str, ...] = ()
+    """Lateral offsets in m, left positive, the first 0, between commas: 0,-1,1."""
+    merge_times: tuple[str, ...] = ()
+    """SPDM's merge distances in s at the current speed, between commas: 4,2,6."""
+    horizon: tuple[float, ...] = ()
+    """T_f: when SPDM's speed profiles reach their target, s."""
+    forecast: tuple[Forecast, ...] = ()
+    """Where the other agents' future comes from."""
+    progress_reference: tuple[Literal["auto", "centerline", "goal"], ...] = ()
+    """What progress is measured along; see spdm plan."""
+    tracker: tuple[Literal["reference", "corrected"], ...] = ()
+    """Velocity fit of the tracker: as published, or with its difference matrix repaired."""
+    set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction] = ()
+    """Any other number of the planner: idm.headway_time=1,1.5 scoring.ttc_weight=5."""
+    out: Path = Path("out/sweep")
+    """Run folder to write or to go on with."""
+    limit: int | None = None
+    """Take the first so many scenarios, in the order of their file names."""
+    chunk: int | Literal["auto"] = "auto"
+    """Scenarios per part of the run folder; auto goes by memory."""
+    shard: str = "1/1"
+    """I/N: take every scenario that falls into part I of N. Parts need no contact with each other
+    and may share a folder."""
+    seed: int = 0
+    """Picks the scenarios of --stage-times."""
+    trajectories: bool = False
+    """Also write the chosen proposals' poses, in map coordinates."""
+    stage_times: bool = False
+    """Also time proposal generation, tracking and scoring for each number of proposals."""
+    cluster: str | None = None
+    """Spread the work with Ray: "local" (or local:4, with four processes), "auto" for the cluster
+    this machine is part of, or an address."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(OnDevice):
+    """Write one HTML page for a run of spdm sweep, or for two of them side by side.
+
+    The page needs no server and no network, and may be moved. It has tables with bootstrap
+    intervals, score and runtime over the number of proposals, two grid points scenario by
+    scenario, the worst scenes with a player, and the failed scenarios with reasons.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A folder that spdm sweep has written, finished or not."""
+    run2: Annotated[Positional[Path | None], arg(metavar="RUN2")] = None
+    """Another one; differences are RUN minus RUN2."""
+    out: Path = Path("report.html")
+    """Page to write."""
+    worst: int = 50
+    """Scenes in each list of worst scenes."""
+    players: int = 12
+    """Scenes in the player, at most; they are planned anew. 0 for none."""
+    scenes: Path | None = None
+    """The folder of the scenario files, if it is no longer where the sweep found it."""
+    figures: Path | None = None
+    """Also write figures for papers (SVG, PDF, PNG) into this folder."""
+    seed: int = 0
+    """Seed of the bootstrap."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Label(Compute):
+    """Score the same vocabulary in every scenario and write labels to train from.
+
+    The same command goes on where an interrupted one stopped, also after a kill. A scenario that
+    fails has no labels and a reason; the exit code is then 1. Read with spdm_jax.open_labels.
+    """
+
+    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
+    """A folder of scenario files (see spdm pack), or one file."""
+    vocabulary: Annotated[Positional[Path], arg(metavar="VOCAB")]
+    """Rear-axle poses x, y, heading in the ego frame, a .npy file [V, T, 3] (see spdm vocab)."""
+    out: Path = Path("out/label")
+    """Folder to write or to go on with."""
+    components: str = "all"
+    """Sub-scores to keep, between commas, or all: total, no_at_fault_collision, drivable_area,
+    driving_direction, time_to_collision, comfort, progress, progress_raw."""
+    dtype: Literal["f16", "f32"] = "f16"
+    """Type of the labels; computation is in --precision."""
+    dt: float = 0.1
+    """Spacing of the vocabulary's poses, s."""
+    tracker: Literal["reference", "corrected", "none"] = "reference"
+    """Track the trajectories first, as the planner does; none scores them as they are."""
+    forecast: Forecast = "constant_velocity"
+    """Where the other agents' future comes from."""
+    progress_reference: Literal["auto", "centerline", "goal"] = "auto"
+    """What progress is measured along: the centreline (auto, as published) or the way to the
+    goal."""
+    limit: int | None = None
+    """Take the first so many scenarios, in the order of their file names."""
+    chunk: int = 64
+    """Scenarios per file of labels, and what a kill can cost at most."""
+    shard: str = "1/1"
+    """I/N: take every scenario that falls into part I of N. Parts need no contact with each other
+    and may share a folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vocab(Compute):
+    """Build a vocabulary: cluster many trajectories by k-means.
+
+    OUT.npy holds the centres [V, 41, 3] (x, y, heading in the ego frame, every 0.1 s), the most
+    frequent first; OUT.json says what they were made from. The same scenarios and seed give the
+    same bytes.
+    """
+
+    action: Annotated[Positional[Literal["build"]], arg(metavar="{build}")]
+    """What to do."""
+    source: Annotated[Positional[Path], arg(metavar="SCENES")]
+    """A folder of scenario files (see spdm pack), or one file."""
+    destination: Annotated[Positional[Path], arg(metavar="OUT.npy")]
+    """File to write."""
+    size: int = 4096
+    """V, trajectories of the vocabulary."""
+    seed: int = 0
+    """Of the first centres, and of --sample."""
+    origin: Annotated[Literal["logs", "proposals"], arg(name="from")] = "logs"
+    """What to cluster: the recorded ego's next 4 s at every step of the logs, or SPDM's tracked
+    proposals at each scenario's start."""
+    num_proposals: int = 60
+    """Proposals per scenario."""
+    sample: int = 200_000
+    """Cluster at most so many trajectories, drawn at random."""
+    limit: int | None = None
+    """Take the first so many scenarios, in the order of their file names."""
+
+
+Options = Demo | Doctor | Label | Pack | Plan | Report | Score | Show | Sweep | Vocab

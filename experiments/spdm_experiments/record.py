@@ -125,7 +125,7 @@ def rows(result: ScoreSet) -> polars.DataFrame:
     )
 
 
-_REASONS = {
+REASONS = {
     "overflow": "more path points or red lights than the planner has room for; raise "
     "PlannerConfig.max_path_points, max_red_lights or max_red_edges in the Python API",
     "failed": "a score is not a finite number; compare with --precision f64, and run: spdm doctor",
@@ -135,7 +135,7 @@ _REASONS = {
 def unusable(result: ScoreSet) -> list[Failure]:
     """Returns the scenes of a result whose scores are not to be used, with reasons."""
     return [
-        Failure(info.token, _REASONS[status])
+        Failure(info.token, REASONS[status])
         for info, status in zip(result.infos, result.status, strict=True)
         if status != "ok"
     ]

@@ -11,7 +11,6 @@ has rows is done, whatever stopped the process before.
 
 import io
 import json
-import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 import polars
 
+from spdm_experiments.description import describe
 from spdm_experiments.inventory import Shard
 from spdm_jax.io.scenario_file import write_atomically
 
@@ -43,7 +43,6 @@ COMPARED = (
 """Entries of run.json that must be the same for a run to go on."""
 NOTED = ("commit", "device")
 """Entries whose change is only mentioned."""
-_SHOWN = 60  # characters of a value in an error text
 
 
 def open_run(folder: Path, about: Mapping[str, Any]) -> list[str]:
@@ -63,75 +62,10 @@ def open_run(folder: Path, about: Mapping[str, Any]) -> list[str]:
     if not path.exists() and any((folder / ROWS).glob("part-*.parquet")):
         raise ValueError(f"{folder}: has rows but no {RUN} that says of what; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
-    content = (json.dumps(about, indent=1) + "\n").encode()
-    notes = [] if not path.exists() and _create(path, content) else _compare(path, content)
+    notes = describe(path, about, COMPARED, NOTED)
     for name in (ROWS, TRAJECTORIES) if about["config"]["trajectories"] else (ROWS,):
         (folder / name).mkdir(exist_ok=True)
     return notes
-
-
-def _compare(path: Path, content: bytes) -> list[str]:
-    """Compares a run.json with what this command would write; see `open_run`."""
-    try:
-        there = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not readable ({error}); use another --out") from error
-    if not isinstance(there, dict):
-        raise ValueError(f"{path}: does not describe a run; use another --out")
-    ours = json.loads(content)
-    for name in COMPARED:
-        found = _difference(name, there.get(name), ours.get(name))
-        if found:
-            where, old, new = found
-            raise ValueError(
-                f"{path} was made with {where} = {_short(old)}, this command says {_short(new)}. "
-                "Use another --out, or the options of that run"
-            )
-    return [
-        f"{name} was {there.get(name)}, is {ours.get(name)} for what is computed from here on"
-        for name in NOTED
-        if there.get(name) != ours.get(name)
-    ]
-
-
-def _create(path: Path, content: bytes) -> bool:
-    """Writes a file that is not there yet; False if another process was first."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    write_atomically(temporary, content)
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        return False
-    except OSError:  # a file system without hard links
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return True
-
-
-def _difference(where: str, old: Any, new: Any) -> tuple[str, Any, Any] | None:
-    """The first place where two JSON values differ."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in {**old, **new}:
-            found = _difference(f"{where}.{name}", old.get(name), new.get(name))
-            if found:
-                return found
-        return None
-    numbers = lambda v: isinstance(v, list) and all(isinstance(x, int | float) for x in v)
-    if isinstance(old, list) and isinstance(new, list) and not (numbers(old) and numbers(new)):
-        if len(old) != len(new):
-            return f"number of {where}", len(old), len(new)
-        for i, pair in enumerate(zip(old, new, strict=True)):
-            found = _difference(f"{where}[{i}]", *pair)
-            if found:
-                return found
-        return None
-    return None if old == new else (where, old, new)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 @contextmanager

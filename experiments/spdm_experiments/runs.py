@@ -8,7 +8,7 @@ import polars
 from rich.table import Table
 
 from spdm_experiments import tables
-from spdm_experiments.chunks import Survey, chunks, head, keep, scenario_files, survey
+from spdm_experiments.chunks import Survey, chunks, head, keep, scenario_files, suite_name, survey
 from spdm_experiments.options import Chunked, Plan, Score, Show
 from spdm_experiments.planners import describe, make_planner
 from spdm_experiments.record import RUN, Record, unusable
@@ -126,7 +126,7 @@ def run_show(options: Show) -> bool:
         page = Path(f"{scenes.infos[0].token}.html")
     if page is not None:
         about = {
-            "suite": _suite(options.scenes, [scenes.infos[0].source]),
+            "suite": suite_name(options.scenes, [scenes.infos[0].source]),
             "precision": options.precision,
         }
         written.append(write_html(page, scenes, result, provenance=provenance_text(about)))
@@ -145,16 +145,10 @@ def _survey(options: Chunked) -> tuple[Survey, Clock]:
     return found, clock
 
 
-def _suite(source: Path, readers: list[str]) -> str:
-    """Names the scenes of a run by what they are, so that no folder's name passes for a suite."""
-    kinds = {"synthetic": "built-in scenes", "nuplan": "nuPlan format", "av2": "Argoverse 2"}
-    return f"{source} ({', '.join(kinds.get(reader, reader) for reader in readers)})"
-
-
 def _about(command: str, options: Chunked, found: Survey) -> dict[str, Any]:
     return {
         "command": command,
-        "suite": _suite(options.scenes, found.sources),
+        "suite": suite_name(options.scenes, found.sources),
         "scenes": str(options.scenes),
         "scenarios": found.num_files,
         "precision": options.precision,
