@@ -44,8 +44,8 @@ def write_page(
         f"(synthetic), single-scene rows on `{about['scene']}`: {main[0]['objects']} objects, "
         f"{main[0]['polygons']} lanes with {main[0]['edges']} edges. Medians of 15 runs, warm, "
         "each next to a run of the yardstick (a 1,024 x 1,024 float32 product of NumPy on one "
-        "thread), which empties the caches in between. The published reference is quoted: one thread of a "
-        "machine of this class, where the yardstick took 29 ms.\n",
+        "thread), which empties the caches in between. The published reference is quoted: one "
+        "thread of a machine of this class, where the yardstick took 29 ms.\n",
         _marks(main, apart),
         "## Other precision, other cores\n\nMedian / minimum, ms.\n",
         _columns(rows),
