@@ -255,14 +255,14 @@ class SceneRunner:
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     def _chunk_size(self, batch, total: int, num_devices: int) -> int:
-        if self.config.chunk is not None:
+        if self.config.chunk is not None:  # also for a short last chunk: the same program
             size = self.config.chunk
         else:
             each = sum(leaf[0].nbytes for leaf in jax.tree.leaves(batch))
             size = max((c for c in _CHUNKS if c * each <= self.config.memory), default=1)
+            size = min(size, total)
         if self._limit is not None:
             size = min(size, self._limit)
-        size = min(size, total)
         return -(-size // num_devices) * num_devices
 
     def _one_chunk(self, items, dtype, devices, rows, size: int) -> Any:
