@@ -258,7 +258,7 @@ def with_nan(tensor: Any) -> Any:
 
 BAD: list[tuple[Callable[[Any], Any], dict[str, Any], str]] = [
     (with_nan, {}, r"trajectories\[1, 2, 3, 0\] is nan; .* \(2 values are not\)"),
-    (lambda t: t.clone().requires_grad_(), {}, "no.*soft_score"),
+    (lambda t: t.clone().requires_grad_(), {}, "has none. Pass trajectories.detach"),
     (lambda t: t[0], {}, r"shape \(16, 41, 3\); expected \[B, P, T, 3\]"),
     (lambda t: t[:, :0], {}, "expected"),
     (lambda t: t[:, :, :30], {}, "30 steps at 0.1 s"),

@@ -219,7 +219,7 @@ def torch_score(
 
     The scenes stay on the device between calls, for as long as the set lives. The score is
     piecewise constant and has no gradient: a tensor that requires one is refused. Use it as a
-    reward (pass `trajectories.detach()`), or `spdm_jax.soft_score` for a smooth surrogate.
+    reward: pass `trajectories.detach()`.
 
     Args:
       scenes: from `spdm_jax.load` or `from_raw`.
@@ -297,7 +297,7 @@ def _check_tensor(trajectories: Tensor, dt: float) -> None:
     if trajectories.requires_grad:
         raise ValueError(
             "trajectories requires a gradient, but the score is piecewise constant and has none. "
-            "Pass trajectories.detach() to use it as a reward, or use spdm_jax.soft_score"
+            "Pass trajectories.detach() to use it as a reward"
         )
     if not dt > 0:
         raise ValueError(f"dt is {dt}; it must be a positive number of seconds")
