@@ -25,16 +25,16 @@ from spdm_jax.config import (
     Tracker,
     spdm,
 )
-from spdm_jax.decision import cast_params
+from spdm_jax.decision import cast_params, poses_only
 from spdm_jax.geometry import ego_box
 from spdm_jax.io.build import build_scenario, start_at
 from spdm_jax.io.crop import MapIndex
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
-from spdm_jax.padding import PaddingConfig, batch, bucket
+from spdm_jax.padding import PATH_ROOM, PaddingConfig, batch, bucket
 from spdm_jax.proposals.lanes import area_masks, drivable_lanes
 from spdm_jax.results import Failure, PlanSet, ScenarioSet, ScoreSet
-from spdm_jax.scoring.aggregate import aggregate
+from spdm_jax.scoring.aggregate import aggregate_sets
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import track
 from spdm_jax.trajectories import (
@@ -47,9 +47,7 @@ from spdm_jax.trajectories import (
     to_local,
     untracked_states,
 )
-from spdm_jax.types import Array, EgoState, Scenario, ScenarioInfo, SubScores
-
-_PATH_BUCKETS = (256, 512, 1024, 2048, 4096)
+from spdm_jax.types import Array, EgoState, Scenario, ScenarioInfo
 
 
 def load(
@@ -168,7 +166,7 @@ def fit_config(scenes: ScenarioSet, config: PlannerConfig) -> PlannerConfig:
             0,
         )
         needed = max(needed, int(points.sum(-1).max()))
-    return replace(config, max_path_points=bucket(needed, _PATH_BUCKETS))
+    return replace(config, max_path_points=bucket(needed, PATH_ROOM))
 
 
 def _forecast_poses(forecast, scenes: ScenarioSet) -> ForecastPoses | None:
@@ -285,10 +283,10 @@ class _Block(struct.PyTreeNode):
 
 def _score_block(scene: Scenario, block: _Block, params: PlannerParams, static):
     config, tracks = static
-    rest = jnp.zeros_like(block.columns["x"])
+    columns = block.columns
     return score_scene(
         scene,
-        EgoState(**{name: block.columns.get(name, rest) for name in STATE_COLUMNS}),
+        poses_only(**columns) if len(columns) == 3 else EgoState(**columns),
         params,
         config,
         tracker=tracks,
@@ -329,28 +327,17 @@ def _score_in_blocks(
     first = lambda v: v.reshape(total, parts, *v.shape[1:])[:, 0]
     seen, overflow = (jax.tree.map(first, tree) for tree in found[2:])
     if parts > 1:
-        scores = _aggregate_anew(scores, params)
+        # Progress and total relative to all proposals of a scene, not those of a block.
+        combined = aggregate_sets(
+            scores.no_at_fault_collision * scores.drivable_area * scores.driving_direction,
+            scores.progress_raw,
+            scores.time_to_collision,
+            scores.comfort,
+            scores.valid,
+            params.scoring,
+        )
+        scores = scores.replace(progress=combined.progress, total=combined.total)
     return scores, tracked, seen, overflow
-
-
-def _aggregate_anew(scores: SubScores, params: PlannerParams) -> SubScores:
-    """Progress and total relative to all proposals of a scene, not those of a block."""
-    dtype = scores.progress_raw.dtype
-    weights = jax.tree.map(lambda value: np.asarray(value, dtype), params.scoring)
-    multiplier = scores.no_at_fault_collision * scores.drivable_area * scores.driving_direction
-    rows = zip(
-        multiplier,
-        scores.progress_raw,
-        scores.time_to_collision,
-        scores.comfort,
-        scores.valid,
-        strict=True,
-    )
-    combined = [aggregate(*row, weights, xp=np) for row in rows]
-    return scores.replace(
-        progress=np.stack([c.progress for c in combined]),
-        total=np.stack([c.total for c in combined]),
-    )
 
 
 def score(

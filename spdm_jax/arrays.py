@@ -4,13 +4,15 @@ XLA lowers `cumsum`, sorting and `nonzero` to long chains of operations on a CPU
 here, a triangular matrix product and pairwise comparisons do the same in a few.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 _ROW = 64
+Carry = TypeVar("Carry")
 
 
 def prefix_sum(values: jax.Array) -> jax.Array:
@@ -71,6 +73,34 @@ def true_indices(flags: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
     wanted = jnp.arange(1, size + 1, dtype=jnp.int32)
     real = wanted <= entries.total
     return jnp.where(real, nth_true(entries, wanted), 0), real
+
+
+def visit_true(
+    flags: jax.Array,
+    size: int,
+    visit: Callable[[jax.Array, jax.Array, Carry], Carry],
+    start: Carry,
+) -> Carry:
+    """Visits all True entries of `[N]` flags, a fixed number at a time.
+
+    Where few of many entries need work, this does the work for those alone, without a limit on how
+    many they are.
+
+    Args:
+      flags: `[N]` bool.
+      size: entries at a time.
+      visit: called with positions `[size]`, which of them are real `[size]`, and the carry.
+      start: first carry.
+    """
+    entries = true_entries(flags)
+
+    def some(state):
+        part, carry = state
+        number = part * size + jnp.arange(size, dtype=jnp.int32)
+        return part + 1, visit(nth_true(entries, number + 1), number < entries.total, carry)
+
+    more = lambda state: state[0] * size < entries.total
+    return jax.lax.while_loop(more, some, (jnp.int32(0), start))[1]
 
 
 def rank_of(*keys: jax.Array) -> jax.Array:

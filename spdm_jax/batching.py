@@ -205,11 +205,7 @@ class SceneRunner:
         )
         threads = min(len(scene_of), self.config.threads or usable_cores())
 
-        def place(leaf: np.ndarray, used: bool) -> Any:
-            # What the function does not read stays on the host.
-            if not used:
-                return _shape_like(leaf, dtype)
-            return jax.device_put(np.asarray(leaf, _type(leaf, dtype)), device)
+        place = partial(place_leaf, dtype=dtype, device=device)
 
         @lru_cache(maxsize=threads)
         def scene(number: int) -> Any:
@@ -279,7 +275,9 @@ class SceneRunner:
             jax.tree.map(lambda leaf: leaf[scene_of[filled]], batch),
             jax.tree.map(lambda leaf: leaf[filled], mine),
         )
-        shape = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, _type(leaf, dtype), sharding=split)
+        shape = lambda leaf: jax.ShapeDtypeStruct(
+            leaf.shape, leaf_type(leaf, dtype), sharding=split
+        )
         args = (
             jax.tree.map(shape, chunk),
             jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype, sharding=whole), shared),
@@ -291,7 +289,7 @@ class SceneRunner:
             args,
             devices,
         )
-        place = lambda leaf: jax.device_put(np.asarray(leaf, _type(leaf, dtype)), split)
+        place = lambda leaf: jax.device_put(np.asarray(leaf, leaf_type(leaf, dtype)), split)
         found = made.call(
             jax.tree.map(place, chunk),
             jax.tree.map(lambda v: jax.device_put(v, whole), shared),
@@ -333,21 +331,28 @@ def x64(precision: Precision):
     return jax.enable_x64(precision == "f64" or jax.config.values["jax_enable_x64"])
 
 
-def _type(leaf: np.ndarray, dtype: np.dtype) -> np.dtype:
+def leaf_type(leaf: np.ndarray, dtype: np.dtype) -> np.dtype:
+    """Type of a leaf in a computation whose floating type is `dtype`."""
     return dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
 
 
 def _shape(leaf: Any, dtype: np.dtype) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(np.shape(leaf), _type(leaf, dtype))
+    return jax.ShapeDtypeStruct(np.shape(leaf), leaf_type(leaf, dtype))
 
 
-def _shape_like(leaf: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """An array of the leaf's shape that takes no memory, for arguments that nobody reads."""
-    return np.broadcast_to(np.zeros((), _type(leaf, dtype)), leaf.shape)
+def place_leaf(leaf: np.ndarray, used: bool, *, dtype: np.dtype, device: Any) -> Any:
+    """Moves a leaf to a device in the type of the computation.
+
+    What a program does not read (`used`) stays on the host, as an array without memory.
+    """
+    kind = leaf_type(leaf, dtype)
+    if not used:
+        return np.broadcast_to(np.zeros((), kind), leaf.shape)
+    return jax.device_put(np.asarray(leaf, kind), device)
 
 
 def _cast(tree: Any, dtype: np.dtype) -> Any:
-    return jax.tree.map(lambda v: np.asarray(v, _type(np.asarray(v), dtype)), tree)
+    return jax.tree.map(lambda v: np.asarray(v, leaf_type(np.asarray(v), dtype)), tree)
 
 
 def usable_cores() -> int:

@@ -21,6 +21,8 @@ from spdm_jax.types import PolygonGrid, Scenario, ScenarioBatch
 _GRID_AREAS = ("lanes", "car_parks", "intersections")
 """Axes of the polygons that the grid numbers, in order."""
 _WORD_BITS = 32
+PATH_ROOM = (256, 512, 1024, 2048, 4096)
+"""Room for the points of a path; few sizes, so few programs."""
 
 
 def bucket(n: int, sizes: Sequence[int]) -> int:

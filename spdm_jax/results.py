@@ -31,6 +31,20 @@ COMFORT_NAMES = (
     "yaw rate",
 )
 
+SCORE_COLUMNS = (
+    "total",
+    "no_at_fault_collision",
+    "drivable_area",
+    "driving_direction",
+    "progress",
+    "time_to_collision",
+    "comfort",
+    "progress_raw",
+    "collision_time",
+    "ttc_time",
+)
+"""Fields of `SubScores` that tables hold, one number per proposal."""
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -182,23 +196,11 @@ class ScoreSet:
 
         valid = np.asarray(self.scores.valid)
         scene, proposal = np.nonzero(valid)
-        names = [
-            "total",
-            "no_at_fault_collision",
-            "drivable_area",
-            "driving_direction",
-            "progress",
-            "time_to_collision",
-            "comfort",
-            "progress_raw",
-            "collision_time",
-            "ttc_time",
-        ]
         tokens = np.array([info.token for info in self.infos])
         columns: dict[str, Any] = {
             "token": tokens[scene],
             "proposal": proposal,
-            **{n: np.asarray(getattr(self.scores, n))[valid] for n in names},
+            **{n: np.asarray(getattr(self.scores, n))[valid] for n in SCORE_COLUMNS},
             "status": np.array(self.status)[scene],
         }
         table = polars.DataFrame(columns).with_columns(polars.lit("").alias("reason"))

@@ -79,19 +79,29 @@ def resample(values: np.ndarray, dt: float) -> np.ndarray:
             f"trajectories has {steps} steps at {dt:g} s; scoring needs {NUM_STATES} at {DT} s "
             f"(0 ... {horizon:g} s). {hint}."
         )
-    time = np.arange(steps) * dt
-    if (steps - 1) * dt < horizon - 1e-6:
-        # The first pose is one interval ahead: put the current one in front.
+    lacks_current, right, weight = resampling(steps, dt)
+    if lacks_current:
         values = np.concatenate([np.zeros_like(values[:, :, :1]), values], axis=2)
-        time = np.arange(steps + 1) * dt
-    wanted = np.arange(NUM_STATES) * DT
-    right = np.clip(np.searchsorted(time, wanted - 1e-9), 1, len(time) - 1)
-    weight = np.clip((wanted - time[right - 1]) / (time[right] - time[right - 1]), 0, 1)
     values = np.concatenate(
         [values[..., :2], np.unwrap(values[..., 2:3], axis=2), values[..., 3:]], axis=-1
     )
     left_values, right_values = values[:, :, right - 1], values[:, :, right]
     return left_values + weight[:, None] * (right_values - left_values)
+
+
+def resampling(steps: int, dt: float) -> tuple[bool, np.ndarray, np.ndarray]:
+    """How 41 states at 0.1 s lie among `steps` poses that cover 4 s.
+
+    Returns:
+      Whether the current pose is to be put in front (the first one is an interval ahead), and for
+      each state, counted with it, the pose to its right `[41]` and the share of that one `[41]`.
+    """
+    lacks_current = (steps - 1) * dt < (NUM_STATES - 1) * DT - 1e-6
+    time = np.arange(steps + lacks_current) * dt
+    wanted = np.arange(NUM_STATES) * DT
+    right = np.clip(np.searchsorted(time, wanted - 1e-9), 1, len(time) - 1)
+    share = np.clip((wanted - time[right - 1]) / (time[right] - time[right - 1]), 0, 1)
+    return lacks_current, right, share
 
 
 def to_local(

@@ -1,16 +1,14 @@
 """The public functions: load, plan, score, explanations, tables."""
 
 import dataclasses
-import importlib.util
-import sys
 from pathlib import Path as FilePath
-from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
+import small_road as roads
 import spdm_jax
 from spdm_jax.config import PlannerConfig, spdm
 from spdm_jax.io.build import build_scenario
@@ -20,20 +18,6 @@ from spdm_jax.types import EgoState, SubScores
 
 STEPS = np.arange(41) * 0.1
 NUM = 8
-
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules, so that they share its compiled functions."""
-    if name not in sys.modules:
-        path = FilePath(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-roads = _load("small_road")
 
 
 def straight(speeds: np.ndarray, dt: float = 0.1, steps: int = 41) -> np.ndarray:

@@ -1,38 +1,23 @@
 """Bad input at the public functions: the message names file, field and value."""
 
 import dataclasses
-import importlib.util
 import json
 import re
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path as FilePath
-from types import ModuleType
 
 import numpy as np
 import pytest
 import shapely
 
+import small_road as roads
 import spdm_jax
 from spdm_jax.io.build import build_scenario
 from spdm_jax.io.raw import RawArea, RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import write_scenario
 from spdm_jax.results import ScenarioSet
 
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules, so that they share its compiled functions."""
-    if name not in sys.modules:
-        path = FilePath(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-roads = _load("small_road")
 GOOD = "good"
 
 

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import batching_child
 from spdm_jax import ScenarioSet, batching, from_raw
 from spdm_jax.batching import (
     MAX_GROUPS,
@@ -32,7 +33,7 @@ from spdm_jax.padding import PaddingConfig, sizes_of
 from spdm_jax.schema import LEAVES
 from spdm_jax.synthetic import make_scene
 
-HERE = Path(__file__).parent
+CHILD = Path(batching_child.__file__)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +143,7 @@ def child(mode: str, devices: int, cache: Path | str, *arguments: str) -> dict[s
         ENVIRONMENT_VARIABLE: str(cache),
     }
     run = subprocess.run(
-        [sys.executable, str(HERE / "batching_child.py"), mode, *arguments],
+        [sys.executable, str(CHILD), mode, *arguments],
         env=environment,
         capture_output=True,
         text=True,

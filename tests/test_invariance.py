@@ -1,11 +1,7 @@
 """What must not change a result: the frame, the order, the padding, the company, the transform."""
 
 import dataclasses
-import importlib.util
-import sys
 from functools import partial
-from pathlib import Path as FilePath
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -13,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import small_road as roads
 import spdm_jax
 from spdm_jax import functional
 from spdm_jax.api import score_scene
@@ -25,20 +22,6 @@ from spdm_jax.types import EgoState, ObjectType, SubScores
 
 NUM = 8
 CONFIG = PlannerConfig(max_path_points=512)
-
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules, so that they share its compiled functions."""
-    if name not in sys.modules:
-        path = FilePath(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-roads = _load("small_road")
 
 
 def busy(token: str = "busy", shift: float = 0.0) -> RawScenario:

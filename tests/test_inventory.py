@@ -1,16 +1,14 @@
 """Scenario files of a sweep: what is known of them unread, and how chunks of them are loaded."""
 
 import dataclasses
-import importlib.util
 import shutil
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import jax
 import numpy as np
 import pytest
 
+import sweep_pack as packs
 from spdm_experiments.inventory import Shard, split, take_inventory
 from spdm_experiments.loading import load_scenes
 from spdm_experiments.sweep_scene import UNREAD, Shared, Switches, read_scene
@@ -21,17 +19,6 @@ from spdm_jax.io.scenario_file import read_scenario
 from spdm_jax.padding import PaddingConfig, batch, sizes_of
 from spdm_jax.schema import leaves_of
 
-
-def _load(name: str) -> ModuleType:
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-packs = _load("sweep_pack")
 COUNT = 7
 TOKENS = [f"scene-{i:02d}" for i in range(COUNT)]
 

@@ -4,7 +4,6 @@ A cheap function stands in for the scorer where the bookkeeping is under test; w
 scene, trajectory and component. One set of scenes is scored for real.
 """
 
-import importlib.util
 import json
 import os
 import pickle
@@ -15,7 +14,6 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType
 from typing import Any, cast
 
 import jax.numpy as jnp
@@ -23,21 +21,12 @@ import numpy as np
 import polars
 import pytest
 
+import sweep_pack
 from spdm_experiments import cli, label_work
 from spdm_experiments.label import parse_components, read_vocabulary
 from spdm_experiments.label_scene import COMPONENTS, Part, Scored
 from spdm_jax import api, labels, load, score
 from spdm_jax.labels import Labels, open_labels
-
-
-def _load(name: str) -> ModuleType:
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
 
 COUNT = 6
 TOKENS = [f"scene-{i:02d}" for i in range(COUNT)]
@@ -48,7 +37,7 @@ SLOW = 10.6  # m/s, some scenes' egos are faster
 @pytest.fixture(scope="module")
 def pack(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pack")
-    assert _load("sweep_pack").write_pack(folder, COUNT) == TOKENS
+    assert sweep_pack.write_pack(folder, COUNT) == TOKENS
     return folder
 
 
@@ -56,7 +45,7 @@ def pack(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bad_pack(pack: Path, tmp_path: Path) -> Path:
     """The pack with a file that is no scenario, and scenes whose ego drives backwards."""
     folder = tmp_path / "pack"
-    _load("sweep_pack").write_pack(folder, COUNT, slow=2)
+    sweep_pack.write_pack(folder, COUNT, slow=2)
     (folder / "broken.npz").write_bytes(b"PK not a zip archive")
     return folder
 

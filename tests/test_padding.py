@@ -1,10 +1,6 @@
 """Padding: masks stay true, indices stay in range, and nothing real changes or is cut."""
 
 import dataclasses
-import importlib.util
-from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +10,8 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from random_world import world
 from spdm_jax.io.build import build_scenario, raw_map
-from spdm_jax.io.raw import RawScenario
 from spdm_jax.padding import (
     PaddingConfig,
     batch,
@@ -27,16 +23,6 @@ from spdm_jax.padding import (
 from spdm_jax.schema import LEAVES, leaves_of
 from spdm_jax.types import PolygonGrid, Scenario, ScenarioInfo
 
-
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"io/{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-world: Callable[..., RawScenario] = _load("random_world").world
 AXES = sorted({axis for leaf in LEAVES.values() for axis in leaf.axes if isinstance(axis, str)})
 # The grid is the largest part of a scenario; small buckets keep these tests quick.
 SMALL = PaddingConfig(grid_cells=(1024, 4096, 16384, 65536, 262144), grid_rows=(64, 512, 4096))

@@ -1,34 +1,18 @@
 """PDM-Closed, step by step, on roads where the right answer is plain."""
 
 import dataclasses
-import importlib.util
-import sys
-from pathlib import Path as FilePath
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import small_road as roads
 from spdm_jax.config import BrakeParams, PlannerConfig, PlannerParams, VehicleParams
 from spdm_jax.decision import brake_trajectory, target_speeds
 from spdm_jax.planner import see
 from spdm_jax.types import EgoState, ObjectType
 
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules, so that they share its compiled functions."""
-    if name not in sys.modules:
-        path = FilePath(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-roads = _load("small_road")
 PDM = roads.PDM
 _see = jax.jit(see, static_argnames="config")
 

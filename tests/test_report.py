@@ -1,19 +1,17 @@
 """Reports: numbers behind the page, the verb, and figures for papers, from made-up run folders."""
 
-import importlib.util
 import io
 import json
 import shutil
-import sys
 from contextlib import redirect_stdout
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import polars
 import pytest
 
+import made_up_run as made_up
 from spdm_experiments import cli, figures
 from spdm_experiments import report_data as numbers
 from spdm_experiments import report_grid as grid
@@ -22,19 +20,6 @@ from spdm_experiments.report_page import page_data, stage_table
 from spdm_experiments.report_scenes import make_players, planner_of, shown_points
 from spdm_jax import pdm_closed, plan, spdm
 
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules."""
-    if name not in sys.modules:
-        path = Path(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-made_up = _load("made_up_run")
 GRID = made_up.GRID
 TOKENS = [f"{kind}-{i}" for i in range(15) for kind in ("curve", "jaywalker")]
 

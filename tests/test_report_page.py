@@ -1,67 +1,26 @@
 """The report's page: complete, self-contained, and alive in a browser."""
 
 import html
-import importlib.util
 import json
 import re
-import shutil
-import subprocess
-import sys
-from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+import browser
+import made_up_run as made_up
+from browser import Page
 from spdm_experiments.report_data import TERMS, Run, load_run, summarise
 from spdm_experiments.report_page import MAX_DOTS, Players, page_data, render
 
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules."""
-    if name not in sys.modules:
-        path = Path(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-made_up = _load("made_up_run")
 GRID = made_up.GRID
 TOKENS = [f"{kind}-{i}" for i in range(12) for kind in ("curve", "jaywalker")]
 TABS = ("summary", "score", "runtime", "compare", "worst", "failures")
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)><!--"
+VOID = ("meta", "link", "input", "br", "img")
 PLAYER = "<!doctype html><script>function showScene(i) { document.title = `scene ${i}`; }</script>"
-
-
-class Page(HTMLParser):
-    """Collects the tags, their attributes and the text of scripts."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.scripts: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "input", "br", "img"):
-            self.open.append(tag)
-        if tag == "script":
-            self.scripts.append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] == "script":
-            self.scripts[-1] += data
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +47,7 @@ def second(folder: Path) -> Run:
 
 def test_page_is_well_formed_and_needs_nothing_else(first: Run, second: Run):
     page = render([first, second])
-    parsed = Page(page)
+    parsed = Page(page, VOID)
     assert parsed.open == [] and len(parsed.scripts) == 4
     # The one address names SVG; nothing is fetched from there.
     rest = page.replace("http://www.w3.org/2000/svg", "")
@@ -106,7 +65,7 @@ def test_names_cannot_leave_the_data(folder: Path):
     rows += made_up.failed_rows(points, "broken-0", EVIL)
     run = load_run(made_up.write_run(folder / "evil", rows, points=points, suite=EVIL, device=EVIL))
     page = render([run], players=Players(f"<p>{EVIL}", [EVIL], [EVIL]))
-    parsed = Page(page)
+    parsed = Page(page, VOID)
     assert len(parsed.scripts) == 4 and "alert" not in "".join(parsed.scripts[2:])
     data = json.loads(parsed.scripts[0])
     assert EVIL in {scene["token"] for scene in data["scenes"]}
@@ -209,31 +168,11 @@ if (view) view.addEventListener("load", () => setTimeout(done)); else done();
 
 
 def browse(folder: Path, page: str) -> tuple[str, list[str]]:
-    """Opens a page in headless Chromium; returns it afterwards and what its console said."""
-    program = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if program is None:
-        pytest.skip("no Chromium found")
+    """Opens a page; returns it afterwards and what its console said."""
     file = folder / "page.html"
     file.write_text(page, encoding="utf-8")
-    run = subprocess.run(
-        [
-            program,
-            *"--headless --no-sandbox --disable-gpu --disable-dev-shm-usage --no-first-run".split(),
-            *"--disable-background-networking --disable-component-update --disable-sync".split(),
-            *"--enable-logging=stderr --window-size=1300,900 --virtual-time-budget=4000".split(),
-            "--allow-file-access-from-files",  # pages within pages
-            f"--user-data-dir={folder / 'profile'}",
-            "--dump-dom",
-            file.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert run.returncode == 0, run.stderr[-2000:]
-    return run.stdout, [line for line in run.stderr.splitlines() if "CONSOLE" in line]
+    within = "--allow-file-access-from-files"  # pages within pages
+    return browser.browse(folder, file, within, "--dump-dom", width=1300, milliseconds=4000)
 
 
 def visit(folder: Path, page: str) -> dict[str, Any]:
@@ -320,7 +259,7 @@ def test_scripts_in_names_stay_text(tmp_path: Path, folder: Path):
     run = load_run(made_up.write_run(folder / "worse", rows, points=GRID[:1], suite=EVIL))
     output, console = browse(tmp_path, render([run]))
     assert console == []  # a picture that cannot be loaded would be told there
-    tags = {tag for tag, _ in Page(output).tags}
+    tags = {tag for tag, _ in Page(output, VOID).tags}
     assert "img" not in tags and "&lt;img src=x" in output
 
 

@@ -1,35 +1,19 @@
 """SPDM: its candidate set, their order, and what it does that PDM-Closed cannot."""
 
-import importlib.util
-import sys
 from functools import partial
-from pathlib import Path as FilePath
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import small_road as roads
 from spdm_jax import api
 from spdm_jax.config import pdm_closed, spdm
 from spdm_jax.io.raw import RawScenario
 from spdm_jax.proposals.spline import RouteLanePaths, route_lane_paths
 from spdm_jax.types import ProposalSet
 
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules, so that they share its compiled functions."""
-    if name not in sys.modules:
-        path = FilePath(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-roads = _load("small_road")
 PDM, SPDM = roads.PDM, roads.SPDM
 
 _paths = jax.jit(route_lane_paths, static_argnames=("num_paths", "max_points"))
@@ -213,14 +197,15 @@ def test_paths_are_rebuilt_once_the_lane_change_is_complete():
     state = roads.init(scene, SPDM.params, config=SPDM.config)
     step = partial(roads.advance, config=SPDM.config)
     names = {}
-    for label, changes in {
-        "on the way": {"ego_y": -0.6},
-        "askew": {"ego_y": -0.2, "ego_heading": 0.2},
-        "complete": {"ego_y": -0.4},
+    for label, (ego_y, ego_heading) in {
+        "on the way": (-0.6, 0.0),
+        "askew": (-0.2, 0.2),
+        "complete": (-0.4, 0.0),
     }.items():
-        other = roads.observe(roads.scene_of(roads.road(**changes)), 0)
+        moved = roads.road(ego_y=ego_y, ego_heading=ego_heading)
+        other = roads.observe(roads.scene_of(moved), 0)
         # Same frame: the rounded origin of that scene differs from this one's.
-        shift = np.round(changes["ego_y"]) - np.round(-3.5)
+        shift = np.round(ego_y) - np.round(-3.5)
         ego = other.ego.replace(y=other.ego.y + shift)
         _, following, _ = step(scene, roads.observe(scene, 0).replace(ego=ego), state, SPDM.params)
         names[label] = following

@@ -4,12 +4,9 @@ A cheap function stands in for the planner where the bookkeeping is under test. 
 the real one.
 """
 
-import importlib.util
 import json
 import shutil
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,23 +14,14 @@ import polars
 import pytest
 from polars.testing import assert_frame_equal
 
+import sweep_child as child
+import sweep_pack as packs
 from spdm_experiments import cli, run_folder, sweep_stages, sweep_work
 from spdm_experiments.inventory import Shard, take_inventory
 from spdm_experiments.sweep_work import Engine
 from spdm_experiments.terminal import RateLine
 from spdm_jax.io.scenario_file import read_scenario
 
-
-def _load(name: str) -> ModuleType:
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-child, packs = _load("sweep_child"), _load("sweep_pack")
 COUNT = 7
 TOKENS = [f"scene-{i:02d}" for i in range(COUNT)]
 

@@ -1,6 +1,5 @@
 """A sweep killed at any moment goes on where it stopped: nothing lost, nothing twice."""
 
-import importlib.util
 import json
 import os
 import shlex
@@ -8,26 +7,16 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import polars
 import pytest
 from polars.testing import assert_frame_equal
 
+import sweep_child as child
+import sweep_pack as packs
 from spdm_experiments import cli, sweep_work
 
-
-def _load(name: str) -> ModuleType:
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-child, packs = _load("sweep_child"), _load("sweep_pack")
 COUNT = 9
 
 

@@ -1,6 +1,5 @@
 """A sweep on a local Ray cluster whose worker is killed: nothing lost, nothing twice."""
 
-import importlib.util
 import json
 import os
 import signal
@@ -8,25 +7,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 
 import polars
 import pytest
 from polars.testing import assert_frame_equal
 
+import sweep_pack
 from spdm_experiments import cli
 
 TABLE = Path("/proc")
 COUNT = 12
-
-
-def _load(name: str) -> ModuleType:
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
 
 
 def test_sweep_without_ray_says_what_to_install(
@@ -74,7 +64,7 @@ def test_lost_worker_costs_nothing(tmp_path: Path):
     if not TABLE.is_dir():
         pytest.skip("needs the process table in /proc")
     pack, whole, out = (tmp_path / name for name in ("pack", "whole", "run"))
-    _load("sweep_pack").write_pack(pack, COUNT)
+    sweep_pack.write_pack(pack, COUNT)
     grid = ["--planner", "pdm-closed", "--num-proposals", "3", "--trajectories"]
     start = [sys.executable, "-m", "spdm_experiments.cli", "sweep", str(pack), *grid, "--out"]
     # In a process of its own, which leaves its program for the workers to load.

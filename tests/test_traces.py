@@ -1,19 +1,17 @@
 """Static settings are hashable, and new values never compile again."""
 
 import dataclasses
-import importlib.util
 import logging
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path as FilePath
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import small_road as roads
 import spdm_jax
 from spdm_jax.config import (
     IDMParams,
@@ -27,19 +25,6 @@ from spdm_jax.config import (
 )
 from spdm_jax.padding import PaddingConfig
 
-
-def _load(name: str) -> ModuleType:
-    """Loads a file once for all test modules, so that they share its compiled functions."""
-    if name not in sys.modules:
-        path = FilePath(__file__).with_name(f"{name}.py")
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec and spec.loader
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-roads = _load("small_road")
 # Two scenes of other content, with the shapes of every set of two in these tests.
 FIRST = [roads.road(things=[roads.parked(25.0)]), roads.road(token="free")]
 SECOND = [

@@ -126,8 +126,7 @@ def write_figures(runs: Sequence[Run], folder: Path, *, seed: int = 0) -> list[P
         }
         for name, figure in figures.items():
             _footer(figure, runs)
-            figure.draw_without_rendering()
-            figure.set_layout_engine("none")  # laid out once, the same in every format
+            _settle(figure)
             for form in FORMATS:
                 written.append(_save(figure, folder / f"{name}.{form}"))
     return written
@@ -340,6 +339,17 @@ def _footer(figure: Figure, runs: Sequence[Run]) -> None:
     assert engine is not None
     engine.set(rect=(0, room / height, 1, 1 - room / height))  # pyright: ignore[reportCallIssue]
     figure.text(0.01, 0.02 / height, text, fontsize=4.6, color="#6b7480", va="bottom", ha="left")
+
+
+def _settle(figure: Figure) -> None:
+    """Lays a figure out once, so that it is the same in every format and at every time.
+
+    The layout's solver does not repeat its last bits, and SVG names are made from all of them.
+    """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        axes.set_position(tuple(round(edge, 6) for edge in axes.get_position().bounds))
 
 
 def _save(figure: Figure, path: Path) -> Path:

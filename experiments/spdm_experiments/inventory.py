@@ -22,7 +22,7 @@ import numpy as np
 
 from spdm_jax import Failure
 from spdm_jax.io.raw import ScenarioError
-from spdm_jax.padding import PaddingConfig
+from spdm_jax.padding import PATH_ROOM, PaddingConfig
 from spdm_jax.schema import LEAVES
 
 METADATA = "metadata.json"
@@ -32,8 +32,6 @@ _SEQUENCES = ("route.centerline_lanes", "route.goal_lanes", "route.branch_lanes"
 _AXES = tuple(field.name for field in dataclasses.fields(PaddingConfig))
 _LEAF_OF = {axis: next(p for p, leaf in LEAVES.items() if axis in leaf.axes) for axis in _AXES}
 """A leaf that has the axis."""
-PATH_ROOM = (256, 512, 1024, 2048, 4096)
-"""Room for the points of a path; few sizes, so few programs."""
 _HEADER = 256
 """Bytes that hold the header of any array of a scenario file."""
 _LOCAL_HEADER = struct.Struct("<26xHH")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from spdm_experiments.chunks import scenario_files, suite_name
-from spdm_experiments.inventory import PATH_ROOM, Inventory, Shard, split, take_inventory
+from spdm_experiments.inventory import Inventory, Shard, split, take_inventory
 from spdm_experiments.label_folder import (
     FORMAT,
     clean,
@@ -21,15 +21,15 @@ from spdm_experiments.label_folder import (
 from spdm_experiments.label_scene import COMPONENTS, Switches
 from spdm_experiments.label_work import MEMORY, Chunk, Group, Labeller, index_row
 from spdm_experiments.options import Label
-from spdm_experiments.run_folder import Progress, alone, note, now
-from spdm_experiments.runtime import configure_jax, provenance, stop_between_chunks
-from spdm_experiments.sweep_work import part_name
+from spdm_experiments.parts import part_name
+from spdm_experiments.run_folder import Progress, alone, note
+from spdm_experiments.runtime import configure_jax, now, provenance, stop_between_chunks
 from spdm_experiments.terminal import RateLine, print_files, reasons
 from spdm_jax import PlannerConfig
 from spdm_jax.batching import ShapeGroup, group_by_shape, prefetch
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.labels import INDEX
-from spdm_jax.padding import bucket
+from spdm_jax.padding import PATH_ROOM, bucket
 from spdm_jax.trajectories import check_trajectories, resample
 
 DTYPES = {"f16": np.dtype(np.float16), "f32": np.dtype(np.float32)}

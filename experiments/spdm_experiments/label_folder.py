@@ -1,13 +1,8 @@
-"""The folder that `spdm label` fills; `spdm_jax.labels` says what is in it and reads it.
-
-Files appear whole, by rename, and a part of the index is the last thing written of its scenes: what
-is in the index is done, whatever stopped the process before.
-"""
+"""The folder that `spdm label` fills; `spdm_jax.labels` says what is in it and reads it."""
 
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +11,7 @@ import polars
 
 from spdm_experiments.description import describe
 from spdm_experiments.inventory import Shard
+from spdm_experiments.parts import clean_parts, read_parts
 from spdm_jax.io.scenario_file import write_atomically
 from spdm_jax.labels import DESCRIPTION, INDEX, SHARDS, VOCABULARY
 
@@ -84,21 +80,13 @@ def open_folder(folder: Path, about: Mapping[str, Any], vocabulary: np.ndarray) 
 
 def clean(folder: Path, shard: Shard) -> None:
     """Removes what a killed process of this shard left half done."""
-    mine = "part-*" if shard.count == 1 else f"part-{shard.name}-*"
-    for name in (SHARDS, INDEX):
-        for path in (folder / name).glob(f".{mine}.tmp"):
-            path.unlink(missing_ok=True)
-    for path in (folder / SHARDS).glob(f"{mine}.npy"):
-        if not (folder / INDEX / f"{path.stem}.parquet").exists():
-            path.unlink(missing_ok=True)
+    clean_parts(folder / INDEX, folder / SHARDS, shard)
 
 
 def read_done(
     folder: Path, shape: tuple[int, int], dtype: np.dtype
 ) -> tuple[dict[str, str], list[str]]:
-    """Reads which scenes are done.
-
-    A part that cannot be used is renamed, so that its scenes are done again.
+    """Reads which scenes are done; see `parts.read_parts`.
 
     Args:
       folder: of the labels.
@@ -107,33 +95,16 @@ def read_done(
 
     Returns:
       Token -> reason ("" where the scene has labels), and what was found damaged, in words.
-
-    Raises:
-      ValueError: two parts hold the same scene.
     """
-    done: dict[str, str] = {}
-    origin: dict[str, str] = {}
-    notes: list[str] = []
-    for path in sorted((folder / INDEX).glob("part-*.parquet")):
-        try:
-            part = polars.read_parquet(path).select(polars.col(list(SCHEMA)))
-            rows = part.filter(polars.col("status") == "ok")["row"].to_list()
-            _check_shard(folder / SHARDS / f"{path.stem}.npy", rows, shape, dtype)
-        except (polars.exceptions.PolarsError, OSError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            notes.append(f"{path}: not usable ({reason}); its scenarios are done again")
-            with suppress(FileNotFoundError):  # another shard was first
-                path.rename(path.with_suffix(".damaged"))
-            continue
+
+    def read(path: Path) -> Iterator[tuple[str, str]]:
+        part = polars.read_parquet(path).select(polars.col(list(SCHEMA)))
+        rows = part.filter(polars.col("status") == "ok")["row"].to_list()
+        _check_shard(folder / SHARDS / f"{path.stem}.npy", rows, shape, dtype)
         for token, status, reason in part.select("token", "status", "reason").iter_rows():
-            if token in origin:
-                raise ValueError(
-                    f"{folder / INDEX}: {origin[token]} and {path.name} both hold scenario "
-                    f"{token!r}; delete one of them"
-                )
-            origin[token] = path.name
-            done[token] = "" if status == "ok" else reason
-    return done, notes
+            yield token, "" if status == "ok" else reason
+
+    return read_parts(folder / INDEX, read, "not usable")
 
 
 def _check_shard(path: Path, rows: list[int], shape: tuple[int, int], dtype: np.dtype) -> None:

@@ -13,7 +13,8 @@ from flax import struct
 
 from spdm_jax.api import score_scene
 from spdm_jax.config import PlannerConfig, PlannerParams
-from spdm_jax.scoring.aggregate import aggregate
+from spdm_jax.decision import poses_only
+from spdm_jax.scoring.aggregate import aggregate_sets
 from spdm_jax.trajectories import STATE_COLUMNS, to_local, untracked_states
 from spdm_jax.types import Array, EgoState, Scenario, ScenarioBatch
 
@@ -76,9 +77,11 @@ def score_part(scene: Scenario, part: Part, params: PlannerParams, static: Switc
       params: traced settings.
       static: static settings.
     """
-    given = dict(enumerate(jnp.moveaxis(part.states, -1, 0)))
-    zero = jnp.zeros_like(given[0])
-    states = EgoState(**{name: given.get(i, zero) for i, name in enumerate(STATE_COLUMNS)})
+    columns = jnp.moveaxis(part.states, -1, 0)
+    if len(columns) == 3:
+        states = poses_only(*columns)
+    else:
+        states = EgoState(**dict(zip(STATE_COLUMNS, columns, strict=True)))
     scores, _, _, overflow = score_scene(
         scene, states, params, static.config, tracker=static.tracks, valid=part.valid
     )
@@ -122,22 +125,13 @@ def join(scored: Scored, count: int, parts: int, params: PlannerParams) -> Score
     whole = lambda v: v.reshape(-1, parts * v.shape[1])[:, :count]
     scores = {name: whole(values) for name, values in scored.scores.items()}
     if parts > 1:
-        dtype = scores["total"].dtype
-        weights = jax.tree.map(lambda value: np.asarray(value, dtype), params.scoring)
-        multiplier = (
-            scores["no_at_fault_collision"] * scores["drivable_area"] * scores["driving_direction"]
+        combined = aggregate_sets(
+            scores["no_at_fault_collision"] * scores["drivable_area"] * scores["driving_direction"],
+            scores["progress_raw"],
+            scores["time_to_collision"],
+            scores["comfort"],
+            np.ones(scores["total"].shape, bool),
+            params.scoring,
         )
-        every: Array = np.ones(count, bool)
-        combined = [
-            aggregate(*row, every, weights, xp=np)
-            for row in zip(
-                multiplier,
-                scores["progress_raw"],
-                scores["time_to_collision"],
-                scores["comfort"],
-                strict=True,
-            )
-        ]
-        scores["progress"] = np.stack([c.progress for c in combined])
-        scores["total"] = np.stack([c.total for c in combined])
+        scores |= {"progress": combined.progress, "total": combined.total}
     return Scored(scores=scores, overflow=scored.overflow.reshape(-1, parts).any(axis=1))

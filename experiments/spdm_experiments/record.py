@@ -8,14 +8,13 @@ import dataclasses
 import io
 import json
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars
 
-from spdm_experiments.runtime import Clock, provenance
+from spdm_experiments.runtime import Clock, now, provenance
 from spdm_jax import Failure, PlanSet, ScenarioSet, ScoreSet
 from spdm_jax.io.scenario_file import write_atomically
 
@@ -38,7 +37,7 @@ class Record:
         self.folder = folder
         self.failed = {failure.token: failure.reason for failure in failures}
         self.files: list[Path] = []
-        self._about = {**about, "started": _now(), **provenance()}
+        self._about = {**about, "started": now(), **provenance()}
         self._frames: list[polars.DataFrame] = []
         self._tokens: list[str] = []
         self._trajectories: list[np.ndarray] = []
@@ -74,7 +73,7 @@ class Record:
             self._write(TRAJECTORIES, buffer.getvalue())
         description = {
             **self._about,
-            "ended": _now(),
+            "ended": now(),
             "finished": finished,
             "scenarios_done": self.num_done(),
             "scenarios_failed": len(self.failed),
@@ -148,7 +147,3 @@ def global_plan(scenes: ScenarioSet, result: PlanSet, row: int) -> np.ndarray:
     values = np.stack(poses, axis=-1).astype(np.float64)
     values[:, :2] += np.asarray(scenes.batch.origin)[row]
     return values
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")

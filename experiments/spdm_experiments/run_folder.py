@@ -14,7 +14,6 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,8 @@ import polars
 
 from spdm_experiments.description import describe
 from spdm_experiments.inventory import Shard
+from spdm_experiments.parts import clean_parts, read_parts
+from spdm_experiments.runtime import now
 from spdm_jax.io.scenario_file import write_atomically
 
 RUN = "run.json"
@@ -105,19 +106,11 @@ def alone(folder: Path, shard: Shard) -> Iterator[None]:
 
 def clean(folder: Path, shard: Shard) -> None:
     """Removes what a killed process of this shard left half done."""
-    mine = "part-*" if shard.count == 1 else f"part-{shard.name}-*"
-    for name in (ROWS, TRAJECTORIES):
-        for path in (folder / name).glob(f".{mine}.tmp"):
-            path.unlink(missing_ok=True)
-    for path in (folder / TRAJECTORIES).glob(f"{mine}.npz"):
-        if not (folder / ROWS / f"{path.stem}.parquet").exists():
-            path.unlink(missing_ok=True)
+    clean_parts(folder / ROWS, folder / TRAJECTORIES, shard)
 
 
 def read_done(folder: Path, num_points: int) -> tuple[dict[str, bool], list[str]]:
-    """Reads which scenarios have rows.
-
-    A part that cannot be read is renamed, so that its scenarios are done again.
+    """Reads which scenarios have rows; see `parts.read_parts`.
 
     Args:
       folder: of the run.
@@ -125,37 +118,19 @@ def read_done(folder: Path, num_points: int) -> tuple[dict[str, bool], list[str]
 
     Returns:
       Token -> whether all its rows are "ok", and what the user should know.
-
-    Raises:
-      ValueError: two parts hold the same scenario.
     """
-    done: dict[str, bool] = {}
-    origin: dict[str, str] = {}
-    notes: list[str] = []
-    for path in sorted((folder / ROWS).glob("part-*.parquet")):
-        try:
-            part = polars.read_parquet(path, columns=["token", "point", "status"])
-            rows = part.group_by("token", maintain_order=True).agg(
-                polars.col("point").sort().alias("points"),
-                (polars.col("status") == "ok").all().alias("ok"),
-            )
-            if any(points != list(range(num_points)) for points in rows["points"].to_list()):
-                raise ValueError(f"not one row for each of {num_points} points")
-        except (polars.exceptions.PolarsError, OSError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            notes.append(f"{path}: not readable ({reason}); its scenarios are done again")
-            with suppress(FileNotFoundError):  # another shard was first
-                path.rename(path.with_suffix(".damaged"))
-            continue
-        for token, ok in zip(rows["token"], rows["ok"], strict=True):
-            if token in origin:
-                raise ValueError(
-                    f"{folder / ROWS}: {origin[token]} and {path.name} both hold scenario "
-                    f"{token!r}; delete one of them"
-                )
-            origin[token] = path.name
-            done[token] = ok
-    return done, notes
+
+    def read(path: Path) -> Iterator[tuple[str, bool]]:
+        part = polars.read_parquet(path, columns=["token", "point", "status"])
+        rows = part.group_by("token", maintain_order=True).agg(
+            polars.col("point").sort().alias("points"),
+            (polars.col("status") == "ok").all().alias("ok"),
+        )
+        if any(points != list(range(num_points)) for points in rows["points"].to_list()):
+            raise ValueError(f"not one row for each of {num_points} points")
+        return zip(rows["token"], rows["ok"], strict=True)
+
+    return read_parts(folder / ROWS, read, "not readable")
 
 
 def write_part(
@@ -212,8 +187,3 @@ def note(lines: Sequence[str]) -> None:
     """Tells the user something on the error stream."""
     for line in lines:
         print(f"note: {line}", file=sys.stderr)
-
-
-def now() -> str:
-    """Returns the time as files hold it."""
-    return datetime.now(UTC).isoformat(timespec="seconds")

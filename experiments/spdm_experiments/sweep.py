@@ -9,8 +9,9 @@ import polars
 from rich.table import Table
 
 from spdm_experiments.chunks import scenario_files, suite_name
-from spdm_experiments.inventory import PATH_ROOM, Inventory, Shard, split, take_inventory
+from spdm_experiments.inventory import Inventory, Shard, split, take_inventory
 from spdm_experiments.options import Sweep
+from spdm_experiments.parts import part_name
 from spdm_experiments.run_folder import (
     FORMAT,
     ROWS,
@@ -18,12 +19,11 @@ from spdm_experiments.run_folder import (
     alone,
     clean,
     note,
-    now,
     open_run,
     read_done,
     write_part,
 )
-from spdm_experiments.runtime import configure_jax, provenance, stop_between_chunks
+from spdm_experiments.runtime import configure_jax, now, provenance, stop_between_chunks
 from spdm_experiments.sweep_grid import Point, make_points, runs_of
 from spdm_experiments.sweep_rows import Layout, failed_rows
 from spdm_experiments.sweep_work import (
@@ -34,7 +34,6 @@ from spdm_experiments.sweep_work import (
     Job,
     load_chunk,
     outcome,
-    part_name,
 )
 from spdm_experiments.tables import console
 from spdm_experiments.terminal import RateLine, print_files, reasons
@@ -47,7 +46,7 @@ from spdm_jax.batching import (
     usable_cores,
 )
 from spdm_jax.io.raw import ScenarioError
-from spdm_jax.padding import bucket
+from spdm_jax.padding import PATH_ROOM, bucket
 
 MEMORY = {"cpu": 128 * 2**20, "gpu": 512 * 2**20}
 """Bytes that the scenarios of one chunk may take; three chunks are in memory at a time."""

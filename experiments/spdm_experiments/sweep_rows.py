@@ -10,8 +10,9 @@ import polars
 from spdm_experiments.inventory import Entry
 from spdm_experiments.record import REASONS
 from spdm_experiments.sweep_grid import varying
-from spdm_experiments.sweep_scene import SCORES, Reading
+from spdm_experiments.sweep_scene import Reading
 from spdm_jax import Failure
+from spdm_jax.results import SCORE_COLUMNS
 
 _TEXT, _WHOLE, _REAL = polars.String, polars.Int32, polars.Float32
 _IDENTITY = {"token": _TEXT, "log_name": _TEXT, "map_name": _TEXT, "scenario_type": _TEXT}
@@ -126,7 +127,7 @@ def scored_rows(
       run_ms: of one scenario.
     """
     values = {name: getattr(reading, name) for name in _CHOICE if hasattr(reading, name)}
-    values |= {name: reading.scores[name] for name in SCORES}
+    values |= {name: reading.scores[name] for name in SCORE_COLUMNS}
     rows = []
     for i, entry in enumerate(entries):
         agent = lambda track, i=i: track_ids[i][track] if track >= 0 else None

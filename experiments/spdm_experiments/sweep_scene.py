@@ -14,21 +14,8 @@ from spdm_jax import planner
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.decision import cast_params
 from spdm_jax.nested import read_nested
+from spdm_jax.results import SCORE_COLUMNS
 from spdm_jax.types import Array, Scenario
-
-SCORES = (
-    "total",
-    "no_at_fault_collision",
-    "drivable_area",
-    "driving_direction",
-    "progress",
-    "time_to_collision",
-    "comfort",
-    "progress_raw",
-    "collision_time",
-    "ttc_time",
-)
-"""Sub-scores of the chosen proposal that a row holds."""
 
 UNREAD = (
     "map.lanes.left_boundary",
@@ -82,7 +69,7 @@ class Reading(struct.PyTreeNode, kw_only=True):
       best: `[C]` int32, chosen proposal; the four fields that follow are its.
       stage, path, policy: `[C]` int32.
       target_speed: `[C]` m/s.
-      scores: the fields `SCORES` of the chosen proposal, `[C]` each.
+      scores: the fields `SCORE_COLUMNS` of the chosen proposal, `[C]` each.
       progress_centerline, progress_goal: `[C]` m.
       collision_track, ttc_track: `[C]` int32, track of the object, -1 if there is none.
       emergency_brake: `[C]` bool.
@@ -145,7 +132,7 @@ def read_scene(scene: Scenario, mine: None, shared: Shared, static: Switches) ->
             path=proposals.path[best],
             policy=policy,
             target_speed=plans.target_speed[policy],
-            scores={name: getattr(scores, name)[best] for name in SCORES},
+            scores={name: getattr(scores, name)[best] for name in SCORE_COLUMNS},
             progress_centerline=plans.progress_centerline[best],
             progress_goal=plans.progress_goal[best],
             collision_track=track(scores.collision_object),

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import polars
 
-from spdm_experiments.inventory import PATH_ROOM, Entry
+from spdm_experiments.inventory import Entry
 from spdm_experiments.sweep_grid import Point
 from spdm_jax import planner
 from spdm_jax.batching import Precision, x64
@@ -25,7 +25,7 @@ from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.decision import cast_params
 from spdm_jax.geometry import ego_box
 from spdm_jax.io.scenario_file import read_scenario, write_atomically
-from spdm_jax.padding import batch, bucket, to_device
+from spdm_jax.padding import PATH_ROOM, batch, bucket, to_device
 from spdm_jax.proposals.lanes import area_masks, drivable_lanes
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import track

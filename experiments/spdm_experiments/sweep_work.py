@@ -4,7 +4,6 @@ Whoever does the work (this process, or a worker of a cluster) is given a `Job` 
 at a time; nothing else is shared.
 """
 
-import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ import numpy as np
 
 from spdm_experiments.inventory import Entry
 from spdm_experiments.loading import LoadedScenes, load_scenes
+from spdm_experiments.parts import part_name
 from spdm_experiments.run_folder import write_part
 from spdm_experiments.sweep_grid import Run
 from spdm_experiments.sweep_rows import Layout, failed_rows, poses_of, scored_rows
@@ -63,12 +63,6 @@ class Job:
     precision: Precision
     trajectories: bool
     batching: BatchConfig
-
-
-def part_name(prefix: str, kind: str, tokens: Sequence[str]) -> str:
-    """Returns the name of a part; the same scenarios always give the same one."""
-    digest = hashlib.sha256("\n".join(tokens).encode()).hexdigest()[:16]
-    return f"part-{prefix}-{kind}-{digest}"
 
 
 @dataclass(frozen=True)

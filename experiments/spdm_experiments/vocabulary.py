@@ -17,7 +17,6 @@ from spdm_experiments.chunks import scenario_files, suite_name
 from spdm_experiments.inventory import (
     DAMAGE,
     METADATA,
-    PATH_ROOM,
     Entry,
     Inventory,
     split,
@@ -27,8 +26,7 @@ from spdm_experiments.label_folder import digest
 from spdm_experiments.loading import load_scenes
 from spdm_experiments.options import Vocab
 from spdm_experiments.record import REASONS
-from spdm_experiments.run_folder import now
-from spdm_experiments.runtime import configure_jax, provenance
+from spdm_experiments.runtime import configure_jax, now, provenance
 from spdm_experiments.sweep_scene import UNREAD
 from spdm_experiments.terminal import print_files, progress_line, reasons
 from spdm_jax import planner, spdm
@@ -36,7 +34,7 @@ from spdm_jax.batching import SceneRunner, group_by_shape, padded_bytes, prefetc
 from spdm_jax.config import NUM_STATES, PlannerConfig, PlannerParams
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.io.scenario_file import write_atomically
-from spdm_jax.padding import bucket
+from spdm_jax.padding import PATH_ROOM, bucket
 from spdm_jax.trajectories import STATE_COLUMNS
 from spdm_jax.types import Array, EgoState, Scenario
 from spdm_jax.vocabulary import Vocabulary, build_vocabulary, ego_futures, in_ego_frame

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from spdm_jax.agents.observation import RedLights
-from spdm_jax.arrays import nth_true, true_entries
+from spdm_jax.arrays import visit_true
 from spdm_jax.geometry import (
     Box,
     Path,
@@ -244,17 +244,11 @@ def _for_pairs(near: jax.Array, visit, start):
       visit: called with path, run and object `[PAIRS]`, which of them are real, and the carry.
       start: first carry.
     """
-    entries = true_entries(near.reshape(-1))
 
-    def some(carry):
-        part, state = carry
-        number = part * PAIRS + jnp.arange(PAIRS, dtype=jnp.int32)
-        index = nth_true(entries, number + 1)
-        path, run, item = jnp.unravel_index(index, near.shape)
-        return part + 1, visit(path, run, item, number < entries.total, state)
+    def some(index, real, carry):
+        return visit(*jnp.unravel_index(index, near.shape), real, carry)
 
-    more = lambda carry: carry[0] * PAIRS < entries.total
-    return jax.lax.while_loop(more, some, (jnp.int32(0), start))[1]
+    return visit_true(near.reshape(-1), PAIRS, some, start)
 
 
 class _Table(NamedTuple):

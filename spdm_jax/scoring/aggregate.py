@@ -5,23 +5,25 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from spdm_jax.config import ScoringParams
+from spdm_jax.types import Array
 
 
 class Aggregate(NamedTuple):
     """`[P]` each: normalised progress and final score."""
 
-    progress: jax.Array
-    total: jax.Array
+    progress: Array
+    total: Array
 
 
 def aggregate(
-    multiplier: jax.Array,
-    progress_raw: jax.Array,
-    ttc: jax.Array,
-    comfort: jax.Array,
-    valid: jax.Array,
+    multiplier: Array,
+    progress_raw: Array,
+    ttc: Array,
+    comfort: Array,
+    valid: Array,
     params: ScoringParams,
     xp: ModuleType = jnp,
 ) -> Aggregate:
@@ -57,3 +59,27 @@ def aggregate(
     )
     dtype = progress_raw.dtype
     return Aggregate(progress.astype(dtype), total.astype(dtype))
+
+
+def aggregate_sets(
+    multiplier: Array,
+    progress_raw: Array,
+    ttc: Array,
+    comfort: Array,
+    valid: Array,
+    params: ScoringParams,
+) -> Aggregate:
+    """`aggregate` of several scenes on the host, for proposals that were scored block by block.
+
+    Args:
+      multiplier: `[B, P]`, like what follows, see `aggregate`.
+      progress_raw: see above.
+      ttc: see above.
+      comfort: see above.
+      valid: see above.
+      params: weights; brought to the type of `progress_raw`.
+    """
+    weights = jax.tree.map(lambda value: np.asarray(value, progress_raw.dtype), params)
+    scenes = zip(multiplier, progress_raw, ttc, comfort, valid, strict=True)
+    each = [aggregate(*scene, weights, xp=np) for scene in scenes]
+    return Aggregate(np.stack([a.progress for a in each]), np.stack([a.total for a in each]))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spdm_jax.arrays import nth_true, true_entries, true_indices
+from spdm_jax.arrays import true_indices, visit_true
 from spdm_jax.config import DT, ScoringParams, VehicleParams
 from spdm_jax.geometry import Box, box_at, boxes_overlap, ego_box
 from spdm_jax.scoring.areas import EgoAreas
@@ -197,22 +197,19 @@ def _judge(touched: jax.Array, violates, columns: int) -> tuple[jax.Array, jax.A
       `[P]` time index (T if none), object (-1 if none) and lowest penalty (1 if none).
     """
     num, num_objects = touched.shape
-    entries = true_entries(touched.reshape(-1))
     never = jnp.int32(columns * num_objects)
 
-    def some(carry):
-        part, key, lowest = carry
-        number = part * _PAIRS + jnp.arange(_PAIRS, dtype=jnp.int32)
-        row, column = jnp.divmod(nth_true(entries, number + 1), num_objects)
+    def some(index, real, carry):
+        key, lowest = carry
+        row, column = jnp.divmod(index, num_objects)
         time, violation, penalty = violates(row, column)
-        row = jnp.where(violation & (number < entries.total), row, num)
+        row = jnp.where(violation & real, row, num)
         # Equal times are resolved by the object's number.
         key = key.at[row].min(time * num_objects + column, mode="drop")
-        return part + 1, key, lowest.at[row].min(penalty, mode="drop")
+        return key, lowest.at[row].min(penalty, mode="drop")
 
-    more = lambda carry: carry[0] * _PAIRS < entries.total
-    start = (jnp.int32(0), jnp.full(num, never), jnp.ones(num, jnp.float32))
-    _, key, lowest = jax.lax.while_loop(more, some, start)
+    start = (jnp.full(num, never), jnp.ones(num, jnp.float32))
+    key, lowest = visit_true(touched.reshape(-1), _PAIRS, some, start)
     hit = key < never
     time = jnp.where(hit, key // num_objects, columns)
     return time, jnp.where(hit, key % num_objects, -1), lowest

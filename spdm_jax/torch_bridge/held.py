@@ -5,13 +5,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from spdm_jax.api import fit_config
-from spdm_jax.batching import Precision, x64
+from spdm_jax.batching import Precision, leaf_type, place_leaf, x64
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.programs import Program
 from spdm_jax.results import ScenarioSet
@@ -106,7 +107,8 @@ class Held:
     def shape(self, count: int | None = None) -> Scenario:
         """Returns the shape of one scenario, or of `count` stacked ones."""
         lead = () if count is None else (count,)
-        like = lambda leaf: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), self._type(leaf))
+        kind = lambda leaf: leaf_type(leaf, self.dtype)
+        like = lambda leaf: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), kind(leaf))
         return jax.tree.map(like, self._batch)
 
     def scene(self, row: int, made: Program) -> Scenario:
@@ -131,17 +133,10 @@ class Held:
                 self._pools[threads] = ThreadPoolExecutor(threads, "spdm-torch")
             return self._pools[threads]
 
-    def _type(self, leaf: np.ndarray) -> np.dtype:
-        return self.dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
-
     def _place(self, made: Program, pick: Any) -> Scenario:
         leaves, tree = jax.tree.flatten(self._batch)
-        placed = []
-        for leaf, used in zip(leaves, made.used, strict=False):
-            part, kind = pick(leaf), self._type(leaf)
-            # What the program does not read stays on the host and takes no memory there.
-            empty = np.broadcast_to(np.zeros((), kind), part.shape)
-            placed.append(jax.device_put(np.asarray(part, kind), self.device) if used else empty)
+        place = partial(place_leaf, dtype=self.dtype, device=self.device)
+        placed = [place(pick(v), u) for v, u in zip(leaves, made.used, strict=False)]
         return jax.tree.unflatten(tree, placed)
 
 

@@ -13,7 +13,8 @@ from flax import struct
 
 from spdm_jax.api import score_scene
 from spdm_jax.config import DT, NUM_STATES, PlannerConfig, PlannerParams
-from spdm_jax.trajectories import STATE_COLUMNS, Frame
+from spdm_jax.decision import poses_only
+from spdm_jax.trajectories import Frame, resampling
 from spdm_jax.types import Array, EgoState, Scenario
 
 COMPONENTS = (
@@ -52,9 +53,7 @@ def score_rows(task: Task, scene: Scenario, trajectories: Array, params: Planner
     """Scores `[P, T, 3]` in one scene (pure)."""
     ego = jax.tree.map(lambda leaf: leaf[scene.num_history], scene.ego)
     poses = place(trajectories, ego, task)
-    rest = jnp.zeros_like(poses[..., 0])
-    given = {"x": poses[..., 0], "y": poses[..., 1], "heading": poses[..., 2]}
-    states = EgoState(**{name: given.get(name, rest) for name in STATE_COLUMNS})
+    states = poses_only(*jnp.moveaxis(poses, -1, 0))
     if not task.tracks:
         states = differentiated(states, ego)
     scores, _, _, overflow = score_scene(scene, states, params, task.config, tracker=task.tracks)
@@ -79,20 +78,15 @@ def score_batch(
 
 def place(values: Array, ego: EgoState, task: Task) -> Array:
     """Local poses `[P, 41, 3]`: `trajectories.resample` and `to_local` on the device."""
-    steps, horizon = values.shape[1], (NUM_STATES - 1) * DT
     here = jnp.stack([ego.x, ego.y, ego.heading])
     if np.isclose(task.dt, DT):
         values = values[:, :NUM_STATES]
     else:
-        time = np.arange(steps) * task.dt
-        if time[-1] < horizon - 1e-6:
-            # The first pose is one interval ahead: put the current one in front.
+        lacks_current, right, share = resampling(values.shape[1], task.dt)
+        if lacks_current:
             front = here if task.frame == "local" else jnp.zeros_like(here)
             front = jnp.broadcast_to(front, (values.shape[0], 1, 3))
-            values, time = jnp.concatenate([front, values], axis=1), np.arange(steps + 1) * task.dt
-        wanted = np.arange(NUM_STATES) * DT
-        right = np.clip(np.searchsorted(time, wanted - 1e-9), 1, len(time) - 1)
-        share = np.clip((wanted - time[right - 1]) / (time[right] - time[right - 1]), 0, 1)
+            values = jnp.concatenate([front, values], axis=1)
         share = jnp.asarray(share, values.dtype)[:, None]
         heading = jnp.unwrap(values[..., 2:], axis=1)
         values = jnp.concatenate([values[..., :2], heading], axis=-1)

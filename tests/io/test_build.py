@@ -1,11 +1,8 @@
 """Raw scenarios to scenarios: what is kept, that nothing is altered, and what is refused."""
 
 import dataclasses
-import importlib.util
 import re
 from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,6 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from random_world import world
 from spdm_jax.io.build import build_scenario, raw_map, start_at
 from spdm_jax.io.crop import MapIndex
 from spdm_jax.io.raw import RawScenario, ScenarioError
@@ -22,16 +20,6 @@ from spdm_jax.schema import LEAVES, check_leaves, leaves_of
 from spdm_jax.synthetic import make_scene
 from spdm_jax.types import Array, Scenario
 
-
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-world: Callable[..., RawScenario] = _load("random_world").world
 HISTORY_4 = 8
 """Seed of a world with 4 history steps."""
 AREA_LAYERS = ("intersections", "car_parks", "drivable", "crosswalks", "walkways", "stop_lines")

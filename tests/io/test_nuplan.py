@@ -1,17 +1,16 @@
 """The reader on a small written log and map: windows, tracks, lights, maps and every error."""
 
-import importlib.util
 import json
 import shutil
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+import nuplan_fixture as fixture
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.types import DrivableKind, LightStatus, ObjectType
 
@@ -21,16 +20,6 @@ from spdm_jax.io.nuplan_filter import ScenarioFilter, Window
 from spdm_jax.io.nuplan_log import UNTAGGED, NuPlanLog
 from spdm_jax.io.nuplan_map import read_map
 
-
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-fixture = _load("nuplan_fixture")
 TAGGED = ScenarioFilter(scenario_types=(fixture.TAG,))
 EGO = (10.0, -1.75, 0.0)
 

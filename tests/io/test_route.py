@@ -11,19 +11,10 @@ import numpy as np
 import pytest
 import shapely
 
+import nuplan_fixture as fixture
 from spdm_jax.io.raw import RawMap, ScenarioError
 from spdm_jax.io.route import correct_route, route_tables, starting_lane
 
-
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-fixture = _load("nuplan_fixture")
 Road = fixture.Road
 
 

@@ -1,15 +1,13 @@
 """Lane sequences along a route: against brute force on random maps, and case by case."""
 
-import importlib.util
 import itertools
 from collections.abc import Sequence
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import shapely
 
+import nuplan_fixture as fixture
 from spdm_jax.io.raw import RawLane, RawMap, RawRoadblock
 from spdm_jax.io.route import RouteTables, route_tables
 from spdm_jax.io.route_paths import (
@@ -25,15 +23,6 @@ from spdm_jax.io.route_paths import (
 Sequences = list[list[str]]
 
 
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-fixture = _load("nuplan_fixture")
 Road = fixture.Road
 
 

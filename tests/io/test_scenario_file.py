@@ -1,7 +1,6 @@
 """Scenario files: bit for bit, the same bytes each time, and loud about anything damaged."""
 
 import dataclasses
-import importlib.util
 import io
 import json
 import os
@@ -9,29 +8,18 @@ import pickle
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from random_world import world
 from spdm_jax.io.build import build_scenario
-from spdm_jax.io.raw import RawScenario, ScenarioError
+from spdm_jax.io.raw import ScenarioError
 from spdm_jax.io.scenario_file import is_complete, read_scenario, write_scenario
 from spdm_jax.schema import LEAVES, from_leaves, leaves_of
 from spdm_jax.types import SCHEMA_VERSION, Scenario, ScenarioInfo
-
-
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-world: Callable[..., RawScenario] = _load("random_world").world
 
 
 @pytest.fixture(scope="module")

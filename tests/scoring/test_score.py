@@ -1,9 +1,6 @@
 """The scorer against a plain walk through time, and what must hold for any input."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path as FilePath
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import plain_scorer as plain
 from spdm_jax.config import ScoringParams, VehicleParams
 from spdm_jax.geometry import make_path
 from spdm_jax.io.grid import build_grid
@@ -28,15 +26,6 @@ NUM_OBJECTS, NUM_PROPOSALS = 6, 8
 seeds = st.integers(0, 2**32 - 1)
 
 
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, FilePath(__file__).with_name(f"{name}.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-plain = _load("plain_scorer")
 _score, _contacts = jax.jit(score_trajectories), jax.jit(first_contacts)
 
 # Two route lanes, an oncoming lane, a connector across the first two, a car park with a hole, and

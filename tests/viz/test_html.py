@@ -3,18 +3,16 @@
 import html
 import json
 import re
-import shutil
-import subprocess
 import sys
 import types
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from browser import Page, browse
 from spdm_jax import __version__
 from spdm_jax.results import PlanSet, ScenarioSet
 from spdm_jax.types import ScenarioInfo
@@ -23,32 +21,6 @@ from spdm_jax.viz.html import page_data, render
 
 BEST, PADDED, NUM = 6, (1, 2), 10  # as in conftest.py
 PROVENANCE = {"suite": "synthetic", "device": "CPU", "seed": "7", "commit": "abc123"}
-
-
-class Page(HTMLParser):
-    """Collects the tags, their attributes and the text of scripts."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.scripts: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "input"):
-            self.open.append(tag)
-        if tag == "script":
-            self.scripts.append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] == "script":
-            self.scripts[-1] += data
 
 
 def refuse(word: str) -> None:
@@ -238,31 +210,6 @@ document.body.append(Object.assign(document.createElement("pre"), {
   id: "report", textContent: JSON.stringify(report),
 }));
 </script></body>"""
-
-
-def browse(folder: Path, file: Path, *arguments: str) -> tuple[str, list[str]]:
-    """Opens a page in headless Chromium; returns its output and what its console said."""
-    program = next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if program is None:
-        pytest.skip("no Chromium found")
-    run = subprocess.run(
-        [
-            program,
-            *"--headless --no-sandbox --disable-gpu --disable-dev-shm-usage --no-first-run".split(),
-            *"--disable-background-networking --disable-component-update --disable-sync".split(),
-            *"--enable-logging=stderr --window-size=1400,900 --virtual-time-budget=2000".split(),
-            f"--user-data-dir={folder / 'profile'}",
-            *arguments,
-            file.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert run.returncode == 0, run.stderr[-2000:]
-    return run.stdout, [line for line in run.stderr.splitlines() if "CONSOLE" in line]
 
 
 def test_picture_is_not_blank(tmp_path: Path, scenes: ScenarioSet, plans: PlanSet):

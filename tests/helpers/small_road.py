@@ -1,7 +1,7 @@
 """Straight roads with hand-placed objects: every number of a scene is known to the test.
 
 The road runs along +x from 0. Lane k's centre line is at y = -3.5 k, so that lane 0 is the leftmost
-and lane 1 lies to its right. Test modules load this file by path (`_load` in each of them).
+and lane 1 lies to its right.
 """
 
 import dataclasses

@@ -13,7 +13,8 @@ from typing import Any, cast
 import jax.numpy as jnp
 
 from spdm_experiments import cli, run_folder, sweep, sweep_work
-from spdm_experiments.sweep_scene import SCORES, Poses, Reading
+from spdm_experiments.sweep_scene import Poses, Reading
+from spdm_jax.results import SCORE_COLUMNS
 
 
 def cheap_read(scene: Any, mine: None, shared: Any, static: Any) -> Reading:
@@ -32,7 +33,7 @@ def cheap_read(scene: Any, mine: None, shared: Any, static: Any) -> Reading:
         path=whole,
         policy=whole,
         target_speed=value,
-        scores={name: value + i for i, name in enumerate(SCORES)},
+        scores={name: value + i for i, name in enumerate(SCORE_COLUMNS)},
         progress_centerline=value,
         progress_goal=value,
         collision_track=0 * whole,
