@@ -48,6 +48,7 @@ ALLOWED = {
     "viz": STAGES | {"io", "planner", "results"},
     "simulation": STAGES | {"planner"},
     "metrics": STAGES | {"planner", "simulation"},
+    "interplan": {"io", *BASE, "metrics", "simulation"},
 }
 # Faces of the library: they may use every part, and no part may use them.
 FACES = {"__init__", "api", "functional", "testing", "torch_bridge", "soft"}

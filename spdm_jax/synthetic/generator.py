@@ -1,5 +1,6 @@
 """Plays a named scene and hands it over as a `RawScenario`, alone or through a `Reader`."""
 
+import functools
 import inspect
 import zlib
 from collections.abc import Callable, Sequence
@@ -65,27 +66,53 @@ def make_scene(name: str, seed: int = 0, **options: object) -> RawScenario:
         if option not in known:
             raise ValueError(f"scene {name!r} has no option {option!r}; it has {', '.join(known)}")
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    return play(
+        functools.partial(SCENES[name], **options), rng, token=f"{name}-{seed}", scenario_type=name
+    )
+
+
+def play(
+    scene: Callable[[np.random.Generator], Stage],
+    rng: np.random.Generator,
+    *,
+    token: str,
+    scenario_type: str,
+    log_name: str = "synthetic",
+    num_iterations: int = NUM_ITERATIONS,
+) -> RawScenario:
+    """Draws place and direction of a scene, sets its stage and records what happens on it.
+
+    Args:
+      scene: sets the stage.
+      rng: source of all variety.
+      token: as in `RawScenario`.
+      scenario_type: likewise.
+      log_name: likewise.
+      num_iterations: likewise.
+    """
     angle = rng.uniform(-np.pi, np.pi)
     origin = np.array(ORIGIN) + np.round(rng.uniform(-2000.0, 2000.0, 2), 1)
-    stage = SCENES[name](rng, **options)
+    stage = scene(rng)
     ego, tracks = simulate(stage.ego, stage.followers, stage.scripted, stage.lights, rng)
     goal = stage.builder.lanes[stage.route[-1]].centerline[-1]
 
     frame = _Frame(float(angle), origin)
     roadblocks = [stage.builder.lanes[lane].roadblock for lane in stage.route]
+    # Lines at which only the recorded ego waits are no lights.
+    lights = {i: status for i, status in stage.lights.items() if i in stage.builder.lanes}
     return RawScenario(
-        token=f"{name}-{seed}",
-        log_name="synthetic",
-        scenario_type=name,
+        token=token,
+        log_name=log_name,
+        scenario_type=scenario_type,
         source="synthetic",
         map=frame.map(stage.builder.build()),
         time_us=START_TIME_US + STEP_US * (np.arange(NUM_STEPS, dtype=np.int64) - NUM_HISTORY),
         num_history=NUM_HISTORY,
-        num_iterations=NUM_ITERATIONS,
+        num_iterations=num_iterations,
         ego=np.column_stack([frame.poses(ego[:, :3]), ego[:, 3:]]),
         ego_valid=np.ones(NUM_STEPS, dtype=bool),
         tracks=frame.tracks(tracks),
-        lights=[{i: int(s[k]) for i, s in stage.lights.items()} for k in range(NUM_STEPS)],
+        lights=[{i: int(s[k]) for i, s in lights.items()} for k in range(NUM_STEPS)],
         route_roadblocks=list(dict.fromkeys(roadblocks)),
         mission_goal=frame.poses(goal),
     )

@@ -44,7 +44,7 @@ def intersection(
       ValueError: an unknown turn, or a distance outside 2 ... 150 m.
     """
     turn = turn or str(rng.choice(list(TURNS)))
-    builder, arms = _crossing(rng, lanes=2, radius=17.0, speed_limit=speed_limit, light=False)
+    builder, arms = four_arms(rng, lanes=2, radius=17.0, speed_limit=speed_limit, light=False)
     connector = f"south>{target_arm(turn)}/{0 if turn == 'left' else 1}"
     stage = approach(builder, [connector], distance, speed, speed_limit)
     line = stage.ego.station + EGO_FRONT + distance - 1.0
@@ -78,7 +78,7 @@ def red_light(
             f"distance is {distance} m and queued {count}; a queue needs 10 m per vehicle and 5 m "
             "more, raise distance or lower queued"
         )
-    builder, arms = _crossing(rng, lanes=2, radius=17.0, speed_limit=speed_limit, light=True)
+    builder, arms = four_arms(rng, lanes=2, radius=17.0, speed_limit=speed_limit, light=True)
     change = green_after - YELLOW_TIME - ALL_RED_TIME
     own = light_phases([(-100.0, LightStatus.RED), (green_after, LightStatus.GREEN)])
     cross = light_phases(
@@ -121,7 +121,7 @@ def tight_turn(
     Raises:
       ValueError: an unknown turn, or a distance outside 2 ... 150 m.
     """
-    builder, arms = _crossing(rng, lanes=1, radius=10.5, speed_limit=speed_limit, light=False)
+    builder, arms = four_arms(rng, lanes=1, radius=10.5, speed_limit=speed_limit, light=False)
     target = target_arm(turn)
     stage = approach(builder, [f"south>{target}/0"], distance, speed, speed_limit)
     area = next(a for a in builder.crosswalks if a.id == f"{target}.crosswalk").polygon
@@ -138,7 +138,7 @@ def tight_turn(
     return stage
 
 
-def _crossing(
+def four_arms(
     rng: np.random.Generator, *, lanes: int, radius: float, speed_limit: float, light: bool
 ) -> tuple[MapBuilder, dict[str, Path]]:
     """Returns four arms of two blocks each around a crossing at the origin, and their paths."""

@@ -119,6 +119,20 @@ class Path:
         profile = t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
         return Path.from_points(self.offset(self.stations, left * profile))
 
+    def smoothed(self, reach: float) -> "Path":
+        """Returns the curve averaged with a Gaussian of standard deviation `reach`, m.
+
+        Jumps of curvature are spread over a few `reach`; a bend of radius r moves inwards by
+        about `reach`^2 / 2r.
+        """
+        half = int(np.ceil(3.0 * reach / self.step))
+        weights = np.exp(-0.5 * (np.arange(-half, half + 1) * self.step / reach) ** 2)
+        weights /= weights.sum()
+        # Straight on beyond the ends, so that both stay where they are.
+        wider = self.pose(self.step * np.arange(-half, len(self.xy) + half))[:, :2]
+        columns = [np.convolve(wider[:, i], weights, mode="valid") for i in range(2)]
+        return Path.from_points(np.stack(columns, axis=1))
+
     def parallel(self, left: float) -> "Path":
         """Returns the parallel curve `left` m to the left."""
         return Path.from_points(self.offset(self.stations, left))

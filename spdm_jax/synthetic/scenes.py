@@ -6,6 +6,7 @@ takes the quantities that a user wants to fix as keyword options.
 
 import numpy as np
 
+from spdm_jax.synthetic.filling import AHEAD, fill_lanes, fill_oncoming, roadside, start_on
 from spdm_jax.synthetic.paths import Path
 from spdm_jax.synthetic.roads import LANE_WIDTH, MARGIN, MapBuilder, add_corridor
 from spdm_jax.synthetic.stage import (
@@ -14,20 +15,17 @@ from spdm_jax.synthetic.stage import (
     CONE,
     EGO_STATION,
     Stage,
-    add_roadside,
     corridor,
     queue,
     standing,
     vehicle,
     walk,
 )
-from spdm_jax.synthetic.traffic import EGO, EGO_FRONT, Follower
+from spdm_jax.synthetic.traffic import EGO_FRONT, Follower
 from spdm_jax.types import ObjectType
 
 ROAD_LENGTH = 630.0
 """Length of a corridor, m: the way of a whole scene, and a planner's horizon beyond it."""
-BEHIND, BESIDE, AHEAD = -50.0, 11.0, 160.0
-"""Where traffic is placed around the ego, m: rearmost, kept clear on its lane, foremost."""
 
 
 def open_road(
@@ -37,7 +35,7 @@ def open_road(
     bends = rng.uniform(-1.0, 1.0, 3) / 180.0
     segments = [(90.0, 0.0), *((180.0, float(k)) for k in bends)]
     builder, _ = corridor(rng, segments, lanes=lanes, oncoming=1, speed_limit=speed_limit)
-    return _start(builder, int(rng.integers(lanes)), speed, speed_limit)
+    return start_on(builder, int(rng.integers(lanes)), speed, speed_limit)
 
 
 def straight(
@@ -52,9 +50,9 @@ def straight(
     """A straight road with several lanes and flowing traffic."""
     segments = [(ROAD_LENGTH, 0.0)]
     builder, path = corridor(rng, segments, lanes=lanes, oncoming=oncoming, speed_limit=speed_limit)
-    stage = _start(builder, int(rng.integers(lanes)), speed, speed_limit)
-    _fill(rng, stage, lanes, oncoming, spacing, speed)
-    _roadside(rng, stage, path, lanes, oncoming)
+    stage = start_on(builder, int(rng.integers(lanes)), speed, speed_limit)
+    fill_lanes(rng, stage, lanes, oncoming, spacing, speed)
+    roadside(rng, stage, path, lanes, oncoming)
     return stage
 
 
@@ -80,9 +78,9 @@ def curve(
     arc = abs(radius) * np.pi / 2
     segments = [(85.0, 0.0), (arc, 1.0 / radius), (ROAD_LENGTH - 85.0 - arc, 0.0)]
     builder, path = corridor(rng, segments, lanes=2, oncoming=1, speed_limit=speed_limit)
-    stage = _start(builder, int(rng.integers(2)), speed, speed_limit)
-    _fill(rng, stage, 2, 1, spacing, speed)
-    _roadside(rng, stage, path, 2, 1)
+    stage = start_on(builder, int(rng.integers(2)), speed, speed_limit)
+    fill_lanes(rng, stage, 2, 1, spacing, speed)
+    roadside(rng, stage, path, 2, 1)
     return stage
 
 
@@ -105,7 +103,7 @@ def parked_car(
         raise ValueError(f"gap is {gap} m; the parked car must be ahead, give a positive gap")
     segments = [(ROAD_LENGTH, 0.0)]
     builder, path = corridor(rng, segments, lanes=2, oncoming=1, speed_limit=speed_limit)
-    stage = _start(builder, 1, speed, speed_limit)
+    stage = start_on(builder, 1, speed, speed_limit)
     own, lane = stage.ego.path, builder.path(builder.follow("road:0/0"))
     size = (rng.uniform(4.2, 5.2), rng.uniform(1.8, 2.0))
     rear = EGO_STATION + EGO_FRONT + gap
@@ -123,8 +121,8 @@ def parked_car(
     stage.followers += queue(
         rng, lane, 0.0, end, 15.0, speed=speed, desired_speed=0.9 * speed_limit
     )
-    _oncoming(rng, stage, 1, 45.0, speed)
-    _roadside(rng, stage, path, 2, 1)
+    fill_oncoming(rng, stage, 1, 45.0, speed)
+    roadside(rng, stage, path, 2, 1)
     return stage
 
 
@@ -205,7 +203,7 @@ def jaywalker(
         )
     segments = [(ROAD_LENGTH, 0.0)]
     builder, path = corridor(rng, segments, lanes=1, oncoming=1, speed_limit=speed_limit)
-    stage = _start(builder, 0, speed, speed_limit)
+    stage = start_on(builder, 0, speed, speed_limit)
     station = EGO_STATION + EGO_FRONT + distance
     side = rng.choice([-1.0, 1.0])
     kerb = LANE_WIDTH + MARGIN + 1.0
@@ -216,8 +214,8 @@ def jaywalker(
     # Oncoming drivers must not be where only luck would spare the pedestrian.
     duration = 2.0 * kerb / walk_speed
     there = path.length - station - 1.3 * speed * (begin + duration + 3.0)
-    _oncoming(rng, stage, 1, 70.0, speed, (there, path.length - station + 10.0))
-    _roadside(rng, stage, path, 1, 1)
+    fill_oncoming(rng, stage, 1, 70.0, speed, (there, path.length - station + 10.0))
+    roadside(rng, stage, path, 1, 1)
     return stage
 
 
@@ -241,14 +239,14 @@ def oncoming(
     bends = rng.uniform(-1.0, 1.0, 2) / 250.0
     segments = [(100.0, 0.0), (200.0, float(bends[0])), (330.0, float(bends[1]))]
     builder, path = corridor(rng, segments, lanes=1, oncoming=1, speed_limit=speed_limit)
-    stage = _start(builder, 0, speed, speed_limit)
+    stage = start_on(builder, 0, speed, speed_limit)
     edge = stage.ego.path.parallel(-rng.uniform(0.3, 1.0))
     pace = min(rng.uniform(3.5, 5.5), speed)
     station = EGO_STATION + EGO_FRONT + bicycle_gap + BICYCLE[0] / 2
     bicycle = Follower(edge, station, pace, pace, BICYCLE, ObjectType.BICYCLE)
     stage.followers.append(bicycle)
-    _oncoming(rng, stage, 1, spacing, speed)
-    _roadside(rng, stage, path, 1, 1)
+    fill_oncoming(rng, stage, 1, spacing, speed)
+    roadside(rng, stage, path, 1, 1)
     return stage
 
 
@@ -262,76 +260,13 @@ def platoon(
     """Dense traffic on two lanes that a slow leader on each lane holds up."""
     segments = [(ROAD_LENGTH, 0.0)]
     builder, path = corridor(rng, segments, lanes=2, oncoming=1, speed_limit=speed_limit)
-    stage = _start(builder, int(rng.integers(2)), speed, speed_limit)
-    _fill(rng, stage, 2, 0, spacing, speed)
+    stage = start_on(builder, int(rng.integers(2)), speed, speed_limit)
+    fill_lanes(rng, stage, 2, 0, spacing, speed)
     for k in range(2):
         lane = builder.path(builder.follow(f"road:0/{k}"))
         station = EGO_STATION + AHEAD + 15.0
         pace = rng.uniform(0.3, 0.9) * speed
         stage.followers.append(vehicle(rng, lane, station, speed, pace))
-    _oncoming(rng, stage, 1, 45.0, speed)
-    _roadside(rng, stage, path, 2, 1)
+    fill_oncoming(rng, stage, 1, 45.0, speed)
+    roadside(rng, stage, path, 2, 1)
     return stage
-
-
-def _start(builder: MapBuilder, lane: int, speed: float, speed_limit: float) -> Stage:
-    """Returns a stage with the ego on lane `lane` of the corridor."""
-    route = builder.follow(f"road:0/{lane}")
-    return Stage(builder, route, Follower(builder.path(route), EGO_STATION, speed, speed_limit))
-
-
-def _fill(
-    rng: np.random.Generator,
-    stage: Stage,
-    lanes: int,
-    oncoming: int,
-    spacing: float,
-    speed: float,
-) -> None:
-    """Puts traffic on all lanes of a corridor, and keeps the ego's place clear."""
-    own = int(stage.route[0].rpartition("/")[2])
-    center = EGO_STATION + float(EGO.rear_axle_to_center)
-    for k in range(lanes):
-        clear = (center - BESIDE, center + BESIDE) if k == own else None
-        stage.followers += queue(
-            rng,
-            stage.builder.path(stage.builder.follow(f"road:0/{k}")),
-            EGO_STATION + BEHIND,
-            EGO_STATION + AHEAD,
-            spacing,
-            speed=speed,
-            desired_speed=0.9 * stage.ego.desired_speed,
-            keep_clear=clear,
-        )
-    _oncoming(rng, stage, oncoming, spacing, speed)
-
-
-def _oncoming(
-    rng: np.random.Generator,
-    stage: Stage,
-    lanes: int,
-    spacing: float,
-    speed: float,
-    keep_clear: tuple[float, float] | None = None,
-) -> None:
-    """Puts traffic on the oncoming lanes; `keep_clear` is in stations of these lanes."""
-    for k in range(lanes):
-        path = stage.builder.path(stage.builder.follow(f"road~:0/{k}"))
-        stage.followers += queue(
-            rng,
-            path,
-            path.length - EGO_STATION - 300.0,
-            path.length - EGO_STATION + 40.0,
-            spacing,
-            speed=speed,
-            desired_speed=0.9 * stage.ego.desired_speed,
-            keep_clear=keep_clear,
-        )
-
-
-def _roadside(
-    rng: np.random.Generator, stage: Stage, path: Path, lanes: int, oncoming: int
-) -> None:
-    """Adds pavements, a car park and the people beside a corridor."""
-    right, left = -lanes * LANE_WIDTH - MARGIN, oncoming * LANE_WIDTH + MARGIN
-    stage.scripted += add_roadside(rng, stage.builder, path, right=right, left=left)

@@ -60,6 +60,7 @@ class Follower:
       gates: (station, connector) pairs of the stop lines of lights.
       give_way: station of the line at which to give way to crossing traffic, m.
       rank: of two drivers who both wait at such lines, the one with the lower rank goes first.
+      jerk_limit: bound on the change of acceleration, m/s^3.
     """
 
     path: Path
@@ -71,6 +72,7 @@ class Follower:
     gates: tuple[tuple[float, str], ...] = ()
     give_way: float | None = None
     rank: int = 1
+    jerk_limit: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,7 @@ class _Traffic:
         sizes = [(float(EGO.length), float(EGO.width)), *(d.size for d in followers)]
         self.half = np.array(sizes) / 2
         self.desired = np.array([d.desired_speed for d in self.drivers])
+        self.change = np.array([d.jerk_limit for d in self.drivers]) * DT
         lines = [-np.inf if d.give_way is None else d.give_way for d in self.drivers]
         self.lines, self.rank = np.array(lines), np.array([d.rank for d in self.drivers])
         # The ego's station is its rear axle's; all other boxes are centred on theirs.
@@ -191,6 +194,8 @@ class _Traffic:
         free = 1.0 - (speed / np.maximum(target, 0.1)) ** 4
         accel = np.clip(ACCEL_MAX * (free - pressure) + noise, -DECEL_LIMIT, ACCEL_MAX)
         accel[self.desired == 0.0] = -DECEL_LIMIT
+        before = self.accel[:, step - 1]
+        accel = np.clip(accel, before - self.change, before + self.change)
         # Nobody rolls backwards: the last braking step ends at speed zero.
         accel = np.maximum(accel, -speed / DT)
         self.accel[:, step] = accel

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spdm_jax.config import DT, Tracker, TrackerParams, VehicleParams
+from spdm_jax.config import DT, Scalar, Tracker, TrackerParams, VehicleParams
 from spdm_jax.geometry import principal, wrap
 from spdm_jax.tracking.profiles import curvature_profile, speed_profile
 from spdm_jax.types import EgoState
@@ -16,7 +16,7 @@ HORIZON = 10
 _CARRIED = ("x", "y", "heading", "vx", "ax", "steering", "steering_rate")
 
 # Sums over the look-ahead steps i = 0..9 at speeds v + b i (b = dt x acceleration). T_i = dt (v +
-# b i) is the distance of step i; see `_lateral_command`.
+# b i) is the distance of step i; see `lateral_command`.
 _I = np.arange(HORIZON)
 _PREFIX = np.concatenate([[0.0], np.cumsum(_I)[:-1]])  # sum of i over the earlier steps
 _PREFIX_SQ = np.concatenate([[0.0], np.cumsum(_I**2)[:-1]])
@@ -31,7 +31,7 @@ _PAIRS_I = (
     float((_PREFIX_SQ + _I * _PREFIX).sum()),
     float((_I * _PREFIX_SQ).sum()),
 )
-_MOMENTS = np.stack(
+LOOKAHEAD_MOMENTS = np.stack(
     [
         np.ones(HORIZON),
         _I.astype(float),
@@ -40,6 +40,7 @@ _MOMENTS = np.stack(
         _I * _SUFFIX,
     ]
 )
+"""`[5, 10]`: sums over the look-ahead's curvatures that `lateral_command` reads."""
 
 
 @lru_cache(maxsize=8)
@@ -49,11 +50,11 @@ def _window_matrix(num_steps: int) -> np.ndarray:
     The window of step k holds curvatures k ... r - 1 with r = min(k + 10, N - 1); what is missing
     to ten is filled with curvature r.
     """
-    matrix = np.zeros((len(_MOMENTS), num_steps, num_steps))
+    matrix = np.zeros((len(LOOKAHEAD_MOMENTS), num_steps, num_steps))
     for k in range(num_steps):
         last = min(k + HORIZON, num_steps - 1)
         for i in range(HORIZON):
-            matrix[:, k, min(k + i, last)] += _MOMENTS[:, i]
+            matrix[:, k, min(k + i, last)] += LOOKAHEAD_MOMENTS[:, i]
     return matrix
 
 
@@ -62,7 +63,7 @@ def _polynomial(coefficients, v, b):
     return c0 * v * v + c1 * v * b + c2 * b * b
 
 
-def _lateral_command(e, psi, delta, v, accel, moments, params: TrackerParams):
+def lateral_command(e, psi, delta, v, accel, moments, params: TrackerParams):
     """Steering rate from the ten-step look-ahead, in closed form.
 
     Euler steps e += T_i psi, psi += T_i (delta / L - kappa_i), delta += dt u (old values on the
@@ -98,8 +99,8 @@ def _command(state, reference, params: TrackerParams, axis: int = 0):
     dx, dy = state.x - reference["x"], state.y - reference["y"]
     e = -dx * reference["sin"] + dy * reference["cos"]
     psi = wrap(state.heading - reference["heading"])
-    moments = [jnp.take(reference["moments"], i, axis=axis) for i in range(len(_MOMENTS))]
-    rate = _lateral_command(e, psi, state.steering, v, accel, moments, params)
+    moments = [jnp.take(reference["moments"], i, axis=axis) for i in range(len(LOOKAHEAD_MOMENTS))]
+    rate = lateral_command(e, psi, state.steering, v, accel, moments, params)
     stopping = (v_ref <= params.stopping_speed) & (v <= params.stopping_speed)
     accel = jnp.where(stopping, -params.stopping_gain * error, accel)
     return accel, jnp.where(stopping, 0, rate)
@@ -111,24 +112,25 @@ def bicycle_step(
     steering_rate: jax.Array,
     vehicle: VehicleParams,
     params: TrackerParams,
+    dt: Scalar = DT,
 ) -> EgoState:
-    """Advances ego states by one step under commanded acceleration and steering rate.
+    """Advances ego states by `dt` seconds under commanded acceleration and steering rate.
 
     Source: tuplan_garage `BatchKinematicBicycleModel` (first-order lags, explicit Euler with the
     old speed, heading and steering angle).
     """
-    accel = state.ax + DT / (DT + params.accel_time_constant) * (accel - state.ax)
-    lag = DT / (DT + params.steering_time_constant)
-    ideal = state.steering + DT * steering_rate
-    rate = (state.steering + lag * (ideal - state.steering) - state.steering) / DT
-    turn = DT * state.vx * jnp.tan(state.steering) / vehicle.wheel_base
-    speed = state.vx + DT * accel
-    steering = jnp.clip(state.steering + DT * rate, -params.max_steering, params.max_steering)
+    accel = state.ax + dt / (dt + params.accel_time_constant) * (accel - state.ax)
+    lag = dt / (dt + params.steering_time_constant)
+    ideal = state.steering + dt * steering_rate
+    rate = (state.steering + lag * (ideal - state.steering) - state.steering) / dt
+    turn = dt * state.vx * jnp.tan(state.steering) / vehicle.wheel_base
+    speed = state.vx + dt * accel
+    steering = jnp.clip(state.steering + dt * rate, -params.max_steering, params.max_steering)
     yaw_rate = speed * jnp.tan(steering) / vehicle.wheel_base
     zero = jnp.zeros_like(speed)
     return EgoState(
-        x=state.x + DT * state.vx * jnp.cos(state.heading),
-        y=state.y + DT * state.vx * jnp.sin(state.heading),
+        x=state.x + dt * state.vx * jnp.cos(state.heading),
+        y=state.y + dt * state.vx * jnp.sin(state.heading),
         heading=principal(state.heading + turn),
         vx=speed,
         vy=zero,
@@ -137,7 +139,7 @@ def bicycle_step(
         steering=steering,
         steering_rate=rate,
         yaw_rate=yaw_rate,
-        yaw_acceleration=(yaw_rate - state.yaw_rate) / DT,
+        yaw_acceleration=(yaw_rate - state.yaw_rate) / dt,
     )
 
 
@@ -157,7 +159,7 @@ def reference_at(
     steps = speed.shape[-1]
     windows = np.swapaxes(_window_matrix(steps), 0, 1).reshape(-1, steps).astype(x.dtype)
     moments = jnp.matmul(windows, curvature.T, precision=jax.lax.Precision.HIGHEST)
-    moments = moments.reshape(steps, len(_MOMENTS), -1)
+    moments = moments.reshape(steps, len(LOOKAHEAD_MOMENTS), -1)
     x, y, heading, speed = x.T[:-1], y.T[:-1], heading.T[:-1], speed.T
     target = np.minimum(np.arange(steps) + HORIZON, steps - 1)
     return {

@@ -15,9 +15,12 @@ from spdm_jax.compile_cache import enable_compile_cache  # noqa: E402
 
 from .closed_loop import replay  # noqa: E402
 from .loader import check_loader_golden  # noqa: E402
+from .logged_run import check_logged_run  # noqa: E402
+from .metrics import check_metrics  # noqa: E402
 from .pdm import check_scene, check_scorer  # noqa: E402
 from .planning import check_planning  # noqa: E402
 from .report import Report  # noqa: E402
+from .simulation import check_simulation  # noqa: E402
 from .units import check_unit  # noqa: E402
 
 
@@ -54,11 +57,14 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
         "scorer_": check_scorer,
         "closedloop_": replay,
         "pdm_": check_planning,
+        "golden_closed_loop_reactive": check_logged_run,
     }
+    # Told apart by the description beside the arrays; several may look at one file.
+    by_description = (check_metrics, check_simulation)
     for path in sorted(folder.rglob("*")):
         if not path.is_file() or only not in path.name:
             continue
-        started = time.time()
+        started, before = time.time(), len(report.rows)
         if path.name in ("expected.json", "golden_devkit.json"):
             # The readers work in float64 whatever the device does.
             if precision == "f64":
@@ -68,13 +74,21 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
             continue
         elif path.name.startswith("unit_") and check_unit(path, report, dtype):
             pass
+        elif any([check(path, report, dtype) for check in by_description]):
+            pass
         else:
             check = next((c for p, c in by_prefix.items() if path.name.startswith(p)), None)
             if check is None:
                 print(f"ignored {path}", file=sys.stderr)
                 continue
             check(path, report, dtype)
-        print(f"{path.name}: {time.time() - started:.1f} s", file=sys.stderr)
+        rows = report.rows[before:]
+        clean = all(row.ok and not row.mismatches for row in rows)
+        print(
+            f"{path.parent.name}/{path.name}: {'clean' if clean else 'NOT CLEAN'}, {len(rows)} "
+            f"arrays, {time.time() - started:.1f} s",
+            file=sys.stderr,
+        )
     return report
 
 

@@ -52,7 +52,8 @@ class Report:
     def close(self, file, array, ours, reference, tolerance, mask=None, angle=False, note=""):
         """Records the largest deviation; NaN or inf must sit in the same places."""
         ours, reference = np.asarray(ours, float), np.asarray(reference, float)
-        difference = np.abs(ours - reference)
+        with np.errstate(invalid="ignore"):  # equal infinities
+            difference = np.abs(ours - reference)
         if angle:
             difference = np.abs(np.arctan2(np.sin(ours - reference), np.cos(ours - reference)))
         same = (ours == reference) | (np.isnan(ours) & np.isnan(reference))

@@ -9,6 +9,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 GOLDEN = ROOT.parent / "shared" / "golden"
 FEW = ("unit_comfort", "unit_path", "unit_lqr", "unit_driving_direction")
+FEW_SIMULATED = ("single_steps", "curve_tail", "yellow_then_red", "random_4")
+FEW_RUNS = ("random_5", "offroad_0p2", "sn_none_speed_limit")
 
 
 def compare(folder: Path, precision: str) -> str:
@@ -41,6 +43,24 @@ def test_a_scene(golden: Path, tmp_path: Path, precision: str):
     scene = sorted(path.name for path in golden.glob("scorer_*.npz"))[0].removeprefix("scorer_")
     for kind in ("scene", "scorer"):
         (tmp_path / f"{kind}_{scene}").symlink_to(golden / f"{kind}_{scene}")
+    assert ", 0 failed" in compare(tmp_path, precision)
+
+
+@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
+def test_closed_loop_metrics(golden: Path, tmp_path: Path, precision: str):
+    runs = golden.with_name("nuplan_metrics") / "closed_loop"
+    for name in ("maps", *(f"{run}.{ending}" for run in FEW_RUNS for ending in ("json", "npz"))):
+        (tmp_path / name).symlink_to(runs / name)
+    assert ", 0 failed" in compare(tmp_path, precision)
+
+
+@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
+def test_simulation(golden: Path, tmp_path: Path, precision: str):
+    cases = golden.with_name("nuplan_sim")
+    for name in FEW_SIMULATED:
+        for path in cases.glob(f"*/{name}.*"):
+            (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "maps").symlink_to(cases / "idm" / "maps")
     assert ", 0 failed" in compare(tmp_path, precision)
 
 

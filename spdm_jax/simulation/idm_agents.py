@@ -1,0 +1,237 @@
+"""Reactive traffic: nuPlan's IDM agents, one step of all of them in turn.
+
+Agents follow lane baselines; each sees what lies in the corridor along its remaining path and
+follows the nearest of it with the intelligent driver model. They move one after the other: later
+ones see where earlier ones have gone.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from spdm_jax.geometry import Box, wrap
+from spdm_jax.simulation.agent_leader import (
+    Lead,
+    Obstacles,
+    find_lead,
+    gather_obstacles,
+    look_ahead,
+)
+from spdm_jax.simulation.agent_paths import append_lane, path_end, start_of_rest
+from spdm_jax.simulation.agent_state import (
+    Agent,
+    AgentParams,
+    AgentSizes,
+    RoadFacts,
+    Traffic,
+    footprint,
+    replayed_boxes,
+)
+from spdm_jax.simulation.history import Snapshot
+from spdm_jax.types import Lanes, LightStatus, ScenarioMap
+
+_IDM_EXPONENT = 4
+
+
+def _extend(
+    agent: Agent, lanes: Lanes, facts: RoadFacts, lights: jax.Array, params: AgentParams
+) -> Agent:
+    """Appends lanes while the path ahead is short.
+
+    Source: nuPlan `IDMAgent.plan_route`.
+    """
+
+    def following(agent):
+        options = lanes.successors[agent.route[-1]]
+        status = lights[options]
+        green, red = status == LightStatus.GREEN, status == LightStatus.RED
+        is_open = (options >= 0) & jnp.where(lanes.has_traffic_light[options], green, ~red)
+        best = jnp.argmin(jnp.where(is_open, facts.curvature[options], jnp.inf))
+        return jnp.where(jnp.any(is_open), options[best], -1)
+
+    def short(state):
+        agent, lane = state
+        ahead = path_end(agent.path) - agent.progress
+        wanted = params.min_path_length + agent.target_speed * params.headway_time
+        return agent.active & (lane >= 0) & (ahead < wanted)
+
+    def append(state):
+        agent, lane = state
+        at = start_of_rest(agent.path, agent.progress)
+        path, overflow = append_lane(agent.path, at, lanes, lane)
+        agent = agent.replace(
+            path=path,
+            progress=jnp.zeros_like(agent.progress),
+            route=jnp.concatenate([agent.route[1:], lane[None]]),
+            overflow=agent.overflow | overflow,
+        )
+        return agent, following(agent)
+
+    return jax.lax.while_loop(short, append, (agent, following(agent)))[0]
+
+
+class _Motion(NamedTuple):
+    """What changes while the agents move in turn, `[K]` each."""
+
+    progress: jax.Array
+    speed: jax.Array
+    target_speed: jax.Array
+    x: jax.Array
+    y: jax.Array
+    heading: jax.Array
+    obstacles: Obstacles
+    moved: jax.Array
+    skipped: jax.Array
+
+
+def idm_acceleration(
+    speed: jax.Array,
+    target: jax.Array,
+    space: jax.Array,
+    lead_speed: jax.Array,
+    params: AgentParams,
+) -> jax.Array:
+    """Acceleration of the intelligent driver model, m/s^2.
+
+    Source: nuPlan `IDMPolicy`; Treiber et al. 2000 (exponent 4).
+    """
+    a, b = params.accel_max, params.decel_max
+    wanted = (
+        params.min_gap
+        + speed * params.headway_time
+        + speed * (speed - lead_speed) / (2 * jnp.sqrt(a * b))
+    )
+    space = jnp.maximum(space, params.min_gap)
+    return jnp.clip(a * (1 - (speed / target) ** _IDM_EXPONENT - (wanted / space) ** 2), -b, a)
+
+
+def step_traffic(
+    traffic: Traffic,
+    scene_map: ScenarioMap,
+    facts: RoadFacts,
+    ego_box: Box,
+    ego_heading: jax.Array,
+    ego_speed: jax.Array,
+    objects: Snapshot,
+    lights: jax.Array,
+    dt: jax.Array,
+    params: AgentParams,
+    sizes: AgentSizes,
+) -> Traffic:
+    """Moves all reactive agents from iteration i to i + 1.
+
+    Args:
+      traffic: agents at i.
+      scene_map: the map.
+      facts: `road_facts` of it.
+      ego_box: the ego at i (agents react to where it was).
+      ego_heading: rad.
+      ego_speed: magnitude of its velocity, m/s.
+      objects: the log at i + 1, for replayed objects.
+      lights: `[L]` status at i + 1.
+      dt: s between the two.
+      params: nuPlan's settings.
+      sizes: static room.
+
+    Source: nuPlan `IDMAgentManager.propagate_agents`. Where nuPlan aborts because an agent's
+    corridor misses the agent itself, the agent stays where it is for this step.
+    """
+    replayed, present, overflow = replayed_boxes(objects, sizes.replayed)
+    agents, lanes = traffic.agents, scene_map.lanes
+    num = agents.active.shape[0]
+    near = jnp.hypot(agents.x - ego_box.x, agents.y - ego_box.y) <= params.radius
+    agents = agents.replace(active=agents.active & near)
+    # Routes and corridors depend on nobody else: all at once.
+    agents = jax.vmap(lambda agent: _extend(agent, lanes, facts, lights, params))(agents)
+    num_stops = facts.stop_edges.shape[0]
+    outlooks = jax.vmap(lambda agent: look_ahead(agent, lanes, lights, num_stops))(agents)
+    ends = jax.vmap(path_end)(agents.path)
+    limit = lanes.speed_limit[agents.route[:, -1]]
+    target = jnp.where(limit > 0, limit, agents.target_speed)
+
+    def advance(i, lead: Lead, now: _Motion):
+        k = jnp.clip(lead.obstacle, 0, num - 1)
+        is_agent, is_ego = (lead.obstacle >= 0) & (lead.obstacle < num), lead.obstacle == num
+        lead_speed = jnp.where(is_agent, now.speed[k], jnp.where(is_ego, ego_speed, 0))
+        direction = jnp.where(is_agent, now.heading[k], ego_heading)
+        lead_speed = lead_speed * jnp.cos(wrap(direction - outlooks.heading[i]))
+        # Where nothing is ahead, the end of the path is a wall.
+        wall = ends[i] - now.progress[i] - 0.5 * agents.length[i]
+        space = jnp.where(lead.obstacle < 0, wall, lead.gap)
+        accel = idm_acceleration(now.speed[i], target[i], space, lead_speed, params)
+        progress = now.progress[i] + now.speed[i] * dt
+        speed = jnp.maximum(now.speed[i] + accel * dt, 0)
+        path = jax.tree.map(lambda v: v[i], agents.path)
+        size = agents.length[i], agents.width[i]
+        return (
+            progress,
+            speed,
+            footprint(path, progress, speed, *size, params, sizes.footprint_points),
+        )
+
+    def update(i, now: _Motion):
+        outlook = jax.tree.map(lambda v: v[i], outlooks)
+        obstacles = now.obstacles
+        stays = (
+            now.progress[i],
+            now.speed[i],
+            (
+                now.x[i],
+                now.y[i],
+                now.heading[i],
+                jax.tree.map(lambda v: v[i], obstacles.shape),
+                obstacles.circle[i],
+            ),
+        )
+
+        def move():
+            half_width = 0.5 * agents.width[i]
+            lead = find_lead(i, half_width, now.moved[i], outlook, obstacles, facts)
+            progress, speed, place = advance(i, lead, now)
+            goes = (progress, speed, tuple(place))
+            return jax.tree.map(
+                lambda a, b: jnp.where(lead.sees_itself, a, b), goes, stays
+            ), lead.sees_itself
+
+        (progress, speed, place), went = jax.lax.cond(
+            agents.active[i], move, lambda: (stays, jnp.bool_(False))
+        )
+        x, y, heading, shape, circle = place
+        put = lambda values, new: values.at[i].set(new)
+        return _Motion(
+            progress=put(now.progress, progress),
+            speed=put(now.speed, speed),
+            target_speed=put(now.target_speed, jnp.where(went, target[i], now.target_speed[i])),
+            x=put(now.x, x),
+            y=put(now.y, y),
+            heading=put(now.heading, heading),
+            obstacles=obstacles._replace(
+                shape=jax.tree.map(put, obstacles.shape, shape),
+                circle=put(obstacles.circle, circle),
+            ),
+            moved=put(now.moved, now.moved[i] | went),
+            skipped=put(now.skipped, now.skipped[i] | (agents.active[i] & ~went)),
+        )
+
+    start = _Motion(
+        progress=agents.progress,
+        speed=agents.speed,
+        target_speed=agents.target_speed,
+        x=agents.x,
+        y=agents.y,
+        heading=agents.heading,
+        obstacles=gather_obstacles(agents, ego_box, replayed, present, facts),
+        moved=agents.moved,
+        skipped=agents.skipped,
+    )
+    end = jax.lax.fori_loop(0, traffic.count, update, start)
+    moved = end._asdict()
+    obstacles = moved.pop("obstacles")
+    agents = agents.replace(
+        **moved,
+        shape=jax.tree.map(lambda v: v[:num], obstacles.shape),
+        circle=obstacles.circle[:num],
+    )
+    overflow |= traffic.overflow | jnp.any(agents.overflow & agents.active)
+    return traffic.replace(agents=agents, overflow=overflow)

@@ -1,0 +1,92 @@
+"""Built-in suites: fixed, seeded collections of scenes with an expert's record.
+
+`common-14` has fourteen everyday situations, `interactive-8` eight in which following a lane does
+not do. Every scene covers a closed-loop run of 15 s: 2.2 s of history, 151 iterations, and 8 s
+beyond each iteration at which a planner is asked.
+
+The record is an expert's by hindsight: a scene is drawn anew, with the next of its seeds, until
+the recorded ego drives faultlessly (`spdm_jax.synthetic.hindsight`).
+"""
+
+import zlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from spdm_jax.io.raw import RawScenario, ScenarioError
+from spdm_jax.synthetic.generator import play
+from spdm_jax.synthetic.hindsight import faults
+from spdm_jax.synthetic.stage import Stage
+from spdm_jax.synthetic.suite_common import COMMON
+from spdm_jax.synthetic.suite_interactive import INTERACTIVE
+
+NUM_ITERATIONS = 151
+"""Iterations of a scene: 15 s with both ends."""
+SCENES_PER_TYPE = 10
+MAX_DRAWS = 40
+"""A scene type that needs more draws for a faultless record is broken."""
+
+SUITES: dict[str, dict[str, Callable[[np.random.Generator], Stage]]] = {
+    "common-14": COMMON,
+    "interactive-8": INTERACTIVE,
+}
+"""Scene functions by scenario type, for each suite."""
+
+
+def suite_names() -> tuple[str, ...]:
+    """Returns the names that `SuiteReader` knows."""
+    return tuple(SUITES)
+
+
+class SuiteReader:
+    """Offers a suite as a data set; tokens are "type-number", such as "changing_lane-07"."""
+
+    def __init__(self, suite: str, numbers: Sequence[int] = range(SCENES_PER_TYPE)):
+        """Selects a suite.
+
+        Args:
+          suite: one of `suite_names()`.
+          numbers: scenes of each type; the suite proper is 0 ... 9, others are further scenes of
+            the same kind, for instance to train on.
+
+        Raises:
+          ValueError: unknown suite or negative number.
+        """
+        if suite not in SUITES:
+            raise ValueError(f"suite {suite!r} is unknown; choose one of {', '.join(SUITES)}")
+        if negative := [n for n in numbers if n < 0]:
+            raise ValueError(f"numbers has {negative}; they must be >= 0")
+        self._suite = suite
+        self._scenes = {f"{t}-{n:02d}": (t, n) for t in SUITES[suite] for n in numbers}
+
+    def tokens(self) -> Sequence[str]:
+        """Returns the tokens, grouped by type."""
+        return tuple(self._scenes)
+
+    def read(self, token: str) -> RawScenario:
+        """Returns one scene; equal tokens give equal bytes.
+
+        Raises:
+          ScenarioError: the token is not among `tokens()`.
+        """
+        if token not in self._scenes:
+            raise ScenarioError(
+                f"suite {self._suite}: token {token!r} is not selected; it must be type-number "
+                f"with a type of the suite (such as {next(iter(self._scenes), None)!r})"
+            )
+        scenario_type, number = self._scenes[token]
+        key = zlib.crc32(f"{self._suite}/{scenario_type}".encode())
+        for draw in range(MAX_DRAWS):
+            raw = play(
+                SUITES[self._suite][scenario_type],
+                np.random.default_rng([draw, number, key]),
+                token=token,
+                scenario_type=scenario_type,
+                log_name=self._suite,
+                num_iterations=NUM_ITERATIONS,
+            )
+            if not faults(raw):
+                return raw
+        raise RuntimeError(
+            f"suite {self._suite}: no faultless record of {token} in {MAX_DRAWS} draws"
+        )
