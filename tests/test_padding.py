@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from random_world import world
 from spdm_jax.io.build import build_scenario, raw_map
 from spdm_jax.padding import (
+    PaddedStack,
     PaddingConfig,
     batch,
     bucket,
-    pad_scenario,
     sizes_of,
     to_device,
 )
-from spdm_jax.schema import LEAVES, leaves_of
+from spdm_jax.schema import LEAVES, from_leaves, leaves_of
 from spdm_jax.types import PolygonGrid, Scenario, ScenarioInfo
 
 AXES = sorted({axis for leaf in LEAVES.values() for axis in leaf.axes if isinstance(axis, str)})
@@ -32,6 +32,12 @@ SMALL = PaddingConfig(grid_cells=(1024, 4096, 16384, 65536, 262144), grid_rows=(
 def built() -> list[tuple[Scenario, ScenarioInfo]]:
     raws = [world(2), world(7, blocks=2, lanes=3, agents=0), world(4, areas=0)]
     return [build_scenario(raw, margin=15.0) for raw in raws]
+
+
+def pad_scenario(scenario: Scenario, sizes: dict[str, int]) -> Scenario:
+    stack = PaddedStack(1, sizes)
+    stack.add(leaves_of(scenario), sizes_of(scenario))
+    return from_leaves({path: np.asarray(array[0]) for path, array in stack.leaves().items()})
 
 
 def polygons_at(grid: PolygonGrid, points: np.ndarray) -> list[set[int]]:
@@ -89,6 +95,21 @@ def test_real_entries_are_unchanged_and_padding_is_inert(
                 rest = leaf.copy()
                 rest[real] = LEAVES[path].fill
                 assert (rest == LEAVES[path].fill).all(), path
+
+
+def test_stack_used_again_holds_nothing_of_before(built: list[tuple[Scenario, ScenarioInfo]]):
+    scenes = [scenario for scenario, _ in built]
+    most = {axis: max(sizes_of(scene)[axis] for scene in scenes) + 2 for axis in AXES}
+    stack = PaddedStack(3, most, dtype=np.float32)
+    for scene in scenes:
+        stack.add(leaves_of(scene), sizes_of(scene))
+    stack.clear()
+    stack.add(leaves_of(scenes[1]), sizes_of(scenes[1]))
+    fresh = leaves_of(pad_scenario(scenes[1], most))
+    for path, array in stack.leaves().items():
+        kind = np.float32 if fresh[path].dtype == np.float64 else fresh[path].dtype
+        assert array.shape == (1, *fresh[path].shape) and array.dtype == kind, path
+        np.testing.assert_array_equal(array[0], fresh[path].astype(kind), err_msg=path)
 
 
 def test_padding_values(built: list[tuple[Scenario, ScenarioInfo]]):
