@@ -60,7 +60,7 @@ class PaddingConfig:
       grid_cells: cells of the polygon grid.
       grid_masks: distinct sets of polygons at cell centres.
       grid_rows: cells crossed by an edge, plus one.
-      grid_slots: edges in one cell.
+      grid_edges: edges of all cells, an edge counted in each.
       route_roadblocks: roadblocks of a route.
       slots: lanes of a route.
       sequence: lanes in a sequence.
@@ -93,7 +93,7 @@ class PaddingConfig:
     grid_cells: tuple[int, ...] = _doubling(65536, 33554432)
     grid_masks: tuple[int, ...] = _doubling(256, 65536)
     grid_rows: tuple[int, ...] = _doubling(4096, 1048576)
-    grid_slots: tuple[int, ...] = _doubling(8, 256)
+    grid_edges: tuple[int, ...] = _doubling(8192, 8388608)
     route_roadblocks: tuple[int, ...] = _doubling(16, 512)
     slots: tuple[int, ...] = _doubling(16, 2048)
     sequence: tuple[int, ...] = _doubling(16, 256)

@@ -229,7 +229,7 @@ def test_groups_hold_everybody_and_are_few(factors: list[float]):
 
 def test_a_large_scene_does_not_blow_up_the_small_ones(scenes: ScenarioSet):
     small = own_sizes(scenes)
-    large = {**small[0], "grid_cells": 8_000_000, "grid_rows": 400_000}
+    large = {**small[0], "grid_cells": 8_000_000, "grid_rows": 400_000, "grid_edges": 900_000}
     groups = group_by_shape([*small, large])
     assert [group.rows for group in groups] == [[0, 1, 2], [3]]
 

@@ -25,7 +25,11 @@ from spdm_jax.types import PolygonGrid, Scenario, ScenarioInfo
 
 AXES = sorted({axis for leaf in LEAVES.values() for axis in leaf.axes if isinstance(axis, str)})
 # The grid is the largest part of a scenario; small buckets keep these tests quick.
-SMALL = PaddingConfig(grid_cells=(1024, 4096, 16384, 65536, 262144), grid_rows=(64, 512, 4096))
+SMALL = PaddingConfig(
+    grid_cells=(1024, 4096, 16384, 65536, 262144),
+    grid_rows=(64, 512, 4096),
+    grid_edges=(64, 1024, 16384),
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +53,11 @@ def polygons_at(grid: PolygonGrid, points: np.ndarray) -> list[set[int]]:
     for cell, center, point in zip(cells, centers, points, strict=True):
         words = grid.masks[grid.cell_mask[cell]]
         inside = {n for n in range(32 * len(words)) if words[n // 32] >> (n % 32) & 1}
-        edges = grid.edges[grid.cell_edges[cell]]
+        row = grid.cell_edges[cell]
+        own = slice(grid.edge_start[row], grid.edge_start[row] + grid.edge_count[row])
+        edges = grid.edges[own]
         way = shapely.LineString([(0, 0), point - center])
-        for edge, polygon in zip(edges, grid.edge_polygon[grid.cell_edges[cell]], strict=True):
+        for edge, polygon in zip(edges, grid.edge_polygon[own], strict=True):
             if polygon >= 0 and way.crosses(shapely.LineString(edge.reshape(2, 2))):
                 inside ^= {int(polygon)}
         found.append(inside)

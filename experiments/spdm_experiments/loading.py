@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from spdm_experiments.inventory import UNREADABLE, Entry
 from spdm_jax import Failure
@@ -53,7 +52,7 @@ class Loader:
       dtype: of floating leaves.
     """
 
-    def __init__(self, *, unread: Sequence[str] = (), dtype: DTypeLike = np.float64):
+    def __init__(self, *, unread: Sequence[str] = (), dtype: type[np.floating] = np.float64):
         self._needed = [path for path in LEAVES if not path.startswith(tuple(unread))]
         self._dtype = dtype
         self._spare: dict[PaddingConfig, list[tuple[int, PaddedStack]]] = {}
