@@ -8,6 +8,7 @@ from spdm_jax.batching import BatchConfig
 from spdm_jax.config import PlannerConfig, PlannerParams, PlannerSpec, pdm_closed, spdm
 from spdm_jax.labels import open_labels
 from spdm_jax.results import Explanation, Failure, PlanSet, ScenarioSet, ScoreSet
+from spdm_jax.soft import SoftScores, soft_score
 from spdm_jax.torch_bridge import TorchScorer, torch_score
 from spdm_jax.vocabulary import build_vocabulary
 
@@ -21,6 +22,7 @@ __all__ = [
     "PlannerSpec",
     "ScenarioSet",
     "ScoreSet",
+    "SoftScores",
     "TorchScorer",
     "build_vocabulary",
     "from_raw",
@@ -30,6 +32,7 @@ __all__ = [
     "pdm_closed",
     "plan",
     "score",
+    "soft_score",
     "spdm",
     "torch_score",
 ]

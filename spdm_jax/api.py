@@ -7,7 +7,7 @@ functions underneath are in `spdm_jax.functional`.
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ from spdm_jax.io.build import build_scenario, start_at
 from spdm_jax.io.crop import MapIndex
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
-from spdm_jax.padding import PATH_ROOM, PaddingConfig, batch, bucket
+from spdm_jax.padding import PATH_ROOM, PaddingConfig, batch, bucket, check_buckets, sizes_of
 from spdm_jax.proposals.lanes import area_masks, drivable_lanes
 from spdm_jax.results import Failure, PlanSet, ScenarioSet, ScoreSet
 from spdm_jax.scoring.aggregate import aggregate_sets
@@ -137,7 +137,7 @@ def _collect(
     fitting = []
     for scenario, info in pairs:
         try:
-            batch([scenario], padding, tokens=[info.token])
+            check_buckets(sizes_of(scenario), padding or PaddingConfig(), info.token)
             fitting.append((scenario, info))
         except ValueError as error:
             failures.append(Failure(info.token, str(error)))
@@ -225,6 +225,51 @@ def plan(
     )
 
 
+class Surroundings(NamedTuple):
+    """One scene at iteration 0 as the scorers see it.
+
+    Attributes:
+      ego: current state, scalars.
+      world: what trajectories are scored against.
+      lanes: `[L]` bool, lanes of the drivable map.
+      parks: `[C]` bool, car parks of it.
+      overflow: `[]` bool, a fixed buffer was too small.
+    """
+
+    ego: EgoState
+    world: World
+    lanes: Array
+    parks: Array
+    overflow: Array
+
+
+def surroundings(
+    scene: Scenario,
+    params: PlannerParams,
+    config: PlannerConfig,
+    forecast: ForecastPoses | None = None,
+) -> Surroundings:
+    """Looks around in one scene at iteration 0 (pure).
+
+    Args:
+      scene: one scenario on the device.
+      params: traced settings, cast to the dtype of the scene.
+      config: static settings.
+      forecast: supplied forecast for all tracks, or None.
+    """
+    state = planning.init(scene, params, config)
+    given = planning.observe(scene, 0).replace(forecast=forecast)
+    seen = planning.see(scene, given, state, params, config)
+    box = ego_box(given.ego, params.vehicle)
+    lanes, parks = drivable_lanes(scene.map, box.x, box.y, params.map_radius)
+    masks = area_masks(scene.map, scene.route.lane_on_route, lanes, parks)
+    path = jax.tree.map(lambda v: v[0], state.paths)
+    if config.progress_reference == "goal":
+        path = state.goal
+    world = World(scene.map.grid, masks, seen.forecast, path)
+    return Surroundings(given.ego, world, lanes, parks, state.overflow | seen.red.overflow)
+
+
 def score_scene(
     scene: Scenario,
     states: EgoState,
@@ -250,22 +295,14 @@ def score_scene(
       `SubScores`, the driven `EgoState` `[P, 41]`, the `AgentForecast` and the overflow flag.
     """
     params = cast_params(params, scene.ego.x.dtype)
-    state = planning.init(scene, params, config)
-    given = planning.observe(scene, 0).replace(forecast=forecast)
-    seen = planning.see(scene, given, state, params, config)
-    box = ego_box(given.ego, params.vehicle)
-    lanes, parks = drivable_lanes(scene.map, box.x, box.y, params.map_radius)
-    masks = area_masks(scene.map, scene.route.lane_on_route, lanes, parks)
-    path = jax.tree.map(lambda v: v[0], state.paths)
-    if config.progress_reference == "goal":
-        path = state.goal
+    around = surroundings(scene, params, config, forecast)
+    world = around.world
     if tracker:
         pose = (states.x, states.y, states.heading)
-        states, _ = track(*pose, given.ego, params.vehicle, params.tracker, config.tracker)
-    world = World(scene.map.grid, masks, seen.forecast, path)
+        states, _ = track(*pose, around.ego, params.vehicle, params.tracker, config.tracker)
     counts = jnp.ones(states.x.shape[0], bool) if valid is None else jnp.asarray(valid)
     scores = score_trajectories(states, counts, world, params.vehicle, params.scoring)
-    return scores, states, seen.forecast, state.overflow | seen.red.overflow
+    return scores, states, world.forecast, around.overflow
 
 
 BLOCK_SIZES = (16, 64, 256, 1024)

@@ -16,6 +16,7 @@ from spdm_jax.planner import (
     step,
 )
 from spdm_jax.scoring.score import World, score_trajectories
+from spdm_jax.soft import soft_score_scene
 from spdm_jax.tracking.lqr import track
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "plan",
     "score_scene",
     "score_trajectories",
+    "soft_score_scene",
     "step",
     "to_device",
     "track",

@@ -6,7 +6,7 @@ nothing is ever truncated. Padding changes no result: masks are False, indices -
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from spdm_jax.schema import LEAVES, check_leaves, from_leaves, leaves_of
-from spdm_jax.types import PolygonGrid, Scenario, ScenarioBatch
+from spdm_jax.schema import KINDS, LEAVES, check_leaves, from_leaves, leaves_of
+from spdm_jax.types import Scenario, ScenarioBatch
 
 _GRID_AREAS = ("lanes", "car_parks", "intersections")
 """Axes of the polygons that the grid numbers, in order."""
 _WORD_BITS = 32
+_MASKS, _EDGE_POLYGON = "map.grid.masks", "map.grid.edge_polygon"
 PATH_ROOM = (256, 512, 1024, 2048, 4096)
 """Room for the points of a path; few sizes, so few programs."""
 
@@ -59,7 +60,7 @@ class PaddingConfig:
       grid_cells: cells of the polygon grid.
       grid_masks: distinct sets of polygons at cell centres.
       grid_rows: cells crossed by an edge, plus one.
-      grid_slots: edges in one cell.
+      grid_edges: edges of all cells, an edge counted in each.
       route_roadblocks: roadblocks of a route.
       slots: lanes of a route.
       sequence: lanes in a sequence.
@@ -92,13 +93,37 @@ class PaddingConfig:
     grid_cells: tuple[int, ...] = _doubling(65536, 33554432)
     grid_masks: tuple[int, ...] = _doubling(256, 65536)
     grid_rows: tuple[int, ...] = _doubling(4096, 1048576)
-    grid_slots: tuple[int, ...] = _doubling(8, 256)
+    grid_edges: tuple[int, ...] = _doubling(8192, 8388608)
     route_roadblocks: tuple[int, ...] = _doubling(16, 512)
     slots: tuple[int, ...] = _doubling(16, 2048)
     sequence: tuple[int, ...] = _doubling(16, 256)
     branches: tuple[int, ...] = _doubling(16, 2048)
     tracks: tuple[int, ...] = _doubling(64, 4096)
     time: tuple[int, ...] = (128, 192, 256, 320, 512, 1024)
+
+
+AXES = tuple(field.name for field in dataclasses.fields(PaddingConfig))
+"""Free axes that have bucket sizes."""
+
+
+def check_buckets(sizes: Mapping[str, int], config: PaddingConfig, name: str) -> None:
+    """Refuses a scenario that is larger than the largest bucket of an axis.
+
+    Args:
+      sizes: length of its free axes.
+      config: bucket sizes.
+      name: of the scenario, for the error text.
+
+    Raises:
+      ValueError: names axis, length and bucket.
+    """
+    for axis in AXES:
+        largest = max(getattr(config, axis))
+        if sizes[axis] > largest:
+            raise ValueError(
+                f"scene {name}: {sizes[axis]} {axis}, largest bucket {largest}. Raise "
+                f"PaddingConfig.{axis} or leave the scene out. Nothing was truncated."
+            )
 
 
 def sizes_of(scenario: Scenario) -> dict[str, int]:
@@ -110,43 +135,73 @@ def sizes_of(scenario: Scenario) -> dict[str, int]:
     return check_leaves({path: np.asarray(leaf) for path, leaf in leaves_of(scenario).items()})
 
 
-def pad_scenario(scenario: Scenario, sizes: Mapping[str, int]) -> Scenario:
-    """Pads a scenario at the end of every free axis.
+class PaddedStack:
+    """Scenarios of one padding, stacked one after the other into arrays that can be used again.
 
-    Polygon numbers in the grid move with the rows they stand for: car parks still follow the
-    last lane row, and intersections the last car-park row.
+    Polygon numbers in the grid move with the rows they stand for: car parks still follow the last
+    lane row, and intersections the last car-park row.
 
     Args:
-      scenario: one scenario with NumPy leaves.
+      count: scenarios at most.
       sizes: length of each free axis but `grid_words`, which follows from the others.
-
-    Returns:
-      A new scenario with NumPy leaves: padded masks are False, indices -1, rows and numbers 0.
+      paths: leaves to hold, by field path; all of them if None.
+      dtype: of floating leaves.
 
     Raises:
-      ValueError: a size is missing or less than the scenario's.
+      ValueError: a size is missing.
     """
-    present = sizes_of(scenario)
-    for axis, size in present.items():
-        if axis == "grid_words":
-            continue
-        if axis not in sizes:
-            raise ValueError(f"sizes lacks axis {axis}, of which the scenario has {size}")
-        if size > sizes[axis]:
-            raise ValueError(
-                f"the scenario has {size} {axis}, sizes says {sizes[axis]}; nothing was truncated"
-            )
-    target = {**sizes, "grid_words": _words(sizes)}
-    grid = _renumber(scenario.map.grid, present, target)
-    moved = scenario.replace(map=scenario.map.replace(grid=grid))
-    padded: dict[str, np.ndarray] = {}
-    for path, leaf in leaves_of(moved).items():
-        spec = LEAVES[path]
-        shape = tuple(axis if isinstance(axis, int) else target[axis] for axis in spec.axes)
-        array = np.full(shape, spec.fill, np.dtype(spec.dtype))
-        array[tuple(slice(n) for n in np.shape(leaf))] = leaf
-        padded[path] = array
-    return from_leaves(padded)
+
+    def __init__(
+        self,
+        count: int,
+        sizes: Mapping[str, int],
+        *,
+        paths: Iterable[str] | None = None,
+        dtype: DTypeLike = np.float64,
+    ):
+        if missing := [axis for axis in AXES if axis not in sizes]:
+            raise ValueError(f"sizes lacks axis {missing[0]}")
+        self._sizes = {**sizes, "grid_words": _words(sizes)}
+        self._count = 0
+        self._arrays: dict[str, np.ndarray] = {}
+        for path in LEAVES if paths is None else paths:
+            axes, kind = LEAVES[path].axes, KINDS[path]
+            shape = (axis if isinstance(axis, int) else self._sizes[axis] for axis in axes)
+            kind = np.dtype(dtype) if kind.kind == "f" else kind
+            self._arrays[path] = np.empty((count, *shape), kind)
+
+    def add(self, leaves: Mapping[str, np.ndarray], present: Mapping[str, int]) -> None:
+        """Pads a scenario at the end of every free axis and takes it in.
+
+        Args:
+          leaves: by field path.
+          present: length of every free axis.
+
+        Raises:
+          ValueError: the scenario is larger than the padding.
+        """
+        for axis, size in present.items():
+            if axis != "grid_words" and size > self._sizes[axis]:
+                raise ValueError(
+                    f"the scenario has {size} {axis}, sizes says {self._sizes[axis]}; "
+                    "nothing was truncated"
+                )
+        moved = _renumbered(leaves, present, self._sizes)
+        for path, array in self._arrays.items():
+            leaf = moved.get(path, leaves[path])
+            row = array[self._count : self._count + 1]
+            if np.shape(leaf) != array.shape[1:]:
+                row.fill(LEAVES[path].fill)
+            row[0, *(slice(n) for n in np.shape(leaf))] = leaf
+        self._count += 1
+
+    def clear(self) -> None:
+        """Forgets the scenarios; arrays handed out before hold those that are added next."""
+        self._count = 0
+
+    def leaves(self) -> dict[str, np.ndarray]:
+        """Returns `[B, ...]` by field path: padded masks are False, indices -1, numbers 0."""
+        return {path: array[: self._count] for path, array in self._arrays.items()}
 
 
 def batch(
@@ -173,18 +228,14 @@ def batch(
     config = PaddingConfig() if config is None else config
     names = [f"#{i}" for i in range(len(scenarios))] if tokens is None else tokens
     found = [sizes_of(scenario) for scenario in scenarios]
-    sizes: dict[str, int] = {}
-    for field in dataclasses.fields(PaddingConfig):
-        axis, buckets = field.name, getattr(config, field.name)
-        for name, present in zip(names, found, strict=True):
-            if present[axis] > max(buckets):
-                raise ValueError(
-                    f"scene {name}: {present[axis]} {axis}, largest bucket {max(buckets)}. Raise "
-                    f"PaddingConfig.{axis} or leave the scene out. Nothing was truncated."
-                )
-        sizes[axis] = bucket(max(present[axis] for present in found), buckets)
-    padded = [leaves_of(pad_scenario(scenario, sizes)) for scenario in scenarios]
-    return from_leaves({path: np.stack([leaves[path] for leaves in padded]) for path in LEAVES})
+    for name, present in zip(names, found, strict=True):
+        check_buckets(present, config, name)
+    largest = {axis: max(present[axis] for present in found) for axis in AXES}
+    sizes = {axis: bucket(size, getattr(config, axis)) for axis, size in largest.items()}
+    stack = PaddedStack(len(scenarios), sizes)
+    for scenario, present in zip(scenarios, found, strict=True):
+        stack.add(leaves_of(scenario), present)
+    return from_leaves(stack.leaves())
 
 
 def to_device(scenarios: ScenarioBatch, dtype: DTypeLike = jnp.float32) -> ScenarioBatch:
@@ -218,20 +269,19 @@ def _words(sizes: Mapping[str, int]) -> int:
     return max(1, -(-sum(sizes[axis] for axis in _GRID_AREAS) // _WORD_BITS))
 
 
-def _renumber(
-    grid: PolygonGrid, present: Mapping[str, int], target: Mapping[str, int]
-) -> PolygonGrid:
+def _renumbered(
+    leaves: Mapping[str, np.ndarray], present: Mapping[str, int], target: Mapping[str, int]
+) -> dict[str, np.ndarray]:
     """Gives the grid's polygons the numbers that they have once their layers are padded."""
     starts = np.cumsum([0, *(target[axis] for axis in _GRID_AREAS[:-1])])
     number = np.concatenate(
         [start + np.arange(present[axis]) for start, axis in zip(starts, _GRID_AREAS, strict=True)]
     ).astype(np.int32)
     # Little-endian words read as bytes, lowest bit first, run in polygon order.
-    words = np.ascontiguousarray(grid.masks, "<u4")
+    words = np.ascontiguousarray(leaves[_MASKS], "<u4")
     bits = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")
     moved = np.zeros((len(bits), target["grid_words"] * _WORD_BITS), np.uint8)
     moved[:, number] = bits[:, : len(number)]
     masks = np.packbits(moved, axis=1, bitorder="little").view("<u4").astype(np.uint32)
     # The appended entry serves -1.
-    edge_polygon = np.append(number, np.int32(-1))[grid.edge_polygon]
-    return grid.replace(masks=masks, edge_polygon=edge_polygon)
+    return {_MASKS: masks, _EDGE_POLYGON: np.append(number, np.int32(-1))[leaves[_EDGE_POLYGON]]}

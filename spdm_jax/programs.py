@@ -3,7 +3,8 @@
 JAX's own cache stores what XLA made, under a key that needs the whole function traced and lowered
 first: seconds for a planner. A program here is found by what it was made from (the source of the
 package, the function's name, settings and shapes), so that a new process starts in a fraction of a
-second. Stored programs are executable code: they live in the private folder of
+second; only after a change of the source is it traced, and compiled if it has become another one.
+Stored programs are executable code: they live in the private folder of
 `spdm_jax.compile_cache` and nowhere else.
 """
 
@@ -27,7 +28,7 @@ import jax.monitoring
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 _FOLDER = "programs"
-_KEPT = 200  # stored programs; the ones used least recently go first
+_KEPT = 400  # names of stored programs; the ones used least recently go first
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def program(
       The program, and whether this call made it.
     """
     leaves, tree = jax.tree.flatten(args)
-    shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     key = (name, source, tree, shapes, tuple(devices), jax.config.values["jax_enable_x64"])
     if found := _PROGRAMS.get(key):
         return found, False
@@ -82,36 +83,57 @@ def program(
             return found, False
         started = time.perf_counter()
         path = _path(name, source, tree, shapes, devices)
-        loaded = path and _load(path, tree, devices)
-        if loaded:
-            call, used = loaded
+        stored = path and _load(path, tree, devices)
+        if stored:
+            call, used = stored
         else:
             traced = make().trace(*args)
-            used = _used(traced.jaxpr.jaxpr)
-            with _cache_hits() as hits:
-                call = traced.lower().compile()
-            # What JAX itself loaded from disk cannot be stored again: it lacks parts of the code.
-            if path and not hits:
-                _store(path, call, used)
-        made = Program(call, used, time.perf_counter() - started, bool(loaded))
+            lowered, used = traced.lower(), _used(traced.jaxpr.jaxpr)
+            twin = path and _twin(path, lowered, devices)
+            stored = twin and _load(twin, tree, devices)
+            if stored:
+                call, _ = stored
+            else:
+                with _not_kept_by_jax() as hits:
+                    call = lowered.compile()
+                if twin and not hits:
+                    _store(twin, call, used)
+            if path and twin:
+                with contextlib.suppress(OSError):
+                    os.link(twin, path)
+        made = Program(call, used, time.perf_counter() - started, bool(stored))
         _PROGRAMS[key] = made
         return made, True
 
 
+def _twin(path: Path, lowered: Any, devices: Sequence) -> Path:
+    """Returns where a program lies under its own text: other source may have given the same."""
+    text = hashlib.sha256(lowered.as_text().encode())
+    return path.with_name(f"{_platform(devices)}-{text.hexdigest()}")
+
+
 @contextlib.contextmanager
-def _cache_hits() -> Iterator[list[str]]:
-    """Collects the programs that JAX loads from its own cache meanwhile."""
+def _not_kept_by_jax() -> Iterator[list[str]]:
+    """Keeps JAX from storing what is compiled meanwhile in its own cache.
+
+    It would be there twice, and what JAX loads from disk cannot be stored again by us: it lacks
+    parts of the code. Collects the programs for which that has happened.
+    """
     hits: list[str] = []
 
     def listen(event: str, **_: Any) -> None:
         if event == "/jax/compilation_cache/cache_hits":
             hits.append(event)
 
+    name = "jax_persistent_cache_min_compile_time_secs"
+    before = jax.config.values[name]
+    jax.config.update(name, float("inf"))
     jax.monitoring.register_event_listener(listen)
     try:
         yield hits
     finally:
         jax.monitoring.unregister_event_listener(listen)
+        jax.config.update(name, before)
 
 
 def _used(jaxpr: Any) -> tuple[bool, ...]:
@@ -133,6 +155,7 @@ def _path(
     except (OSError, TypeError):  # typed at a prompt
         return None
     facts = (
+        _platform(devices),
         repr(name),
         source.__module__,
         source.__qualname__,
@@ -140,13 +163,20 @@ def _path(
         package_digest(),
         str(tree),
         shapes,
+    )
+    return Path(folder, _FOLDER, hashlib.sha256(repr(facts).encode()).hexdigest())
+
+
+def _platform(devices: Sequence) -> str:
+    """Digest of what a program depends on besides its own text."""
+    facts = (
         [(d.platform, d.device_kind, d.id) for d in devices],
         jax.config.values["jax_enable_x64"],
         jax.__version__,
         importlib.metadata.version("jaxlib"),
         os.environ.get("XLA_FLAGS", ""),
     )
-    return Path(folder, _FOLDER, hashlib.sha256(repr(facts).encode()).hexdigest())
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
 
 
 @functools.cache

@@ -5,6 +5,7 @@ Scenario files are checked against this table and batches are padded by it, so a
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_type_hints
@@ -105,8 +106,10 @@ LEAVES: dict[str, Leaf] = {
     "map.grid.cell_mask": Leaf("int32", ("grid_cells",)),
     "map.grid.cell_edges": Leaf("int32", ("grid_cells",)),
     "map.grid.masks": Leaf("uint32", ("grid_masks", "grid_words")),
-    "map.grid.edges": Leaf("float64", ("grid_rows", "grid_slots", 4)),
-    "map.grid.edge_polygon": Leaf("int32", ("grid_rows", "grid_slots"), _INDEX),
+    "map.grid.edge_start": Leaf("int32", ("grid_rows",)),
+    "map.grid.edge_count": Leaf("int32", ("grid_rows",)),
+    "map.grid.edges": Leaf("float64", ("grid_edges", 4)),
+    "map.grid.edge_polygon": Leaf("int32", ("grid_edges",), _INDEX),
     "route.roadblocks": Leaf("int32", ("route_roadblocks",), _INDEX),
     "route.given_roadblocks": Leaf("int32", ("route_roadblocks",), _INDEX),
     "route.lane_on_route": Leaf("bool", ("lanes",)),
@@ -132,6 +135,9 @@ LEAVES: dict[str, Leaf] = {
 }
 """Leaves of a `Scenario` by field path."""
 
+KINDS = {path: np.dtype(leaf.dtype) for path, leaf in LEAVES.items()}
+"""Host types of the leaves by field path."""
+
 
 def leaves_of(tree: struct.PyTreeNode) -> dict[str, Any]:
     """Returns the leaves of a scenario (batch, or part) by field path, in the order of fields."""
@@ -141,12 +147,12 @@ def leaves_of(tree: struct.PyTreeNode) -> dict[str, Any]:
 
 
 def _collect(node: struct.PyTreeNode, prefix: str, leaves: dict[str, Any]) -> None:
-    for field in dataclasses.fields(node):  # type: ignore[arg-type]
-        value = getattr(node, field.name)
-        if isinstance(value, struct.PyTreeNode):
-            _collect(value, f"{prefix}{field.name}.", leaves)
+    for name, kind in _fields(type(node)):
+        value = getattr(node, name)
+        if kind is None:
+            leaves[prefix + name] = value
         else:
-            leaves[prefix + field.name] = value
+            _collect(value, f"{prefix}{name}.", leaves)
 
 
 def from_leaves(leaves: Mapping[str, Any]) -> Scenario:
@@ -160,11 +166,19 @@ def from_leaves(leaves: Mapping[str, Any]) -> Scenario:
 
 def _assemble(node: type, prefix: str, leaves: Mapping[str, Any]) -> Any:
     values = {}
-    for name, kind in get_type_hints(node).items():
-        nested = isinstance(kind, type) and issubclass(kind, struct.PyTreeNode)
+    for name, kind in _fields(node):
         path = prefix + name
-        values[name] = _assemble(kind, f"{path}.", leaves) if nested else leaves[path]
+        values[name] = leaves[path] if kind is None else _assemble(kind, f"{path}.", leaves)
     return node(**values)
+
+
+@functools.cache
+def _fields(node: type) -> tuple[tuple[str, type | None], ...]:
+    """Fields of a node, each with its class where it is a node itself."""
+    hints = get_type_hints(node)
+    nested = lambda kind: isinstance(kind, type) and issubclass(kind, struct.PyTreeNode)
+    names = [field.name for field in dataclasses.fields(node)]
+    return tuple((name, hints[name] if nested(hints[name]) else None) for name in names)
 
 
 def check_leaves(leaves: Mapping[str, np.ndarray]) -> dict[str, int]:
@@ -178,7 +192,7 @@ def check_leaves(leaves: Mapping[str, np.ndarray]) -> dict[str, int]:
     origin: dict[str, str] = {}
     for path, leaf in LEAVES.items():
         array = leaves[path]
-        if array.dtype != np.dtype(leaf.dtype):
+        if array.dtype != KINDS[path]:
             raise ValueError(f"{path}: dtype {array.dtype}, expected {leaf.dtype}")
         if array.ndim != len(leaf.axes):
             raise ValueError(f"{path}: shape {array.shape}, expected axes {leaf.axes}")

@@ -25,7 +25,7 @@ Array: TypeAlias = Any
 """A `numpy.ndarray` on the host, a `jax.Array` on the device: no type checker follows a pytree from
 one to the other, so fields are named for people and left open for the checker."""
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of the scenario file layout; raised whenever a stored field changes its meaning."""
 
 
@@ -109,10 +109,12 @@ class PolygonGrid(struct.PyTreeNode, kw_only=True):
       cell_size: `[]` m.
       shape: `[2]` int32, number of cells in x and y; cell (i, j) is stored at `i * ny + j`.
       cell_mask: `[C]` int32, row of `masks` for the cell centre.
-      cell_edges: `[C]` int32, row of `edges`; row 0 is empty.
+      cell_edges: `[C]` int32, row of `edge_start` and `edge_count`; row 0 has no edges.
       masks: `[U, W]` uint32, bit sets of polygons.
-      edges: `[K, E, 4]` x0, y0, x1, y1 relative to the cell centre; padding is all zero.
-      edge_polygon: `[K, E]` int32, polygon of each edge, -1 for padding.
+      edge_start: `[K]` int32, first edge of the cells of a row.
+      edge_count: `[K]` int32, number of their edges.
+      edges: `[E, 4]` x0, y0, x1, y1 relative to the cell's centre, row after row.
+      edge_polygon: `[E]` int32, polygon of each edge, -1 for padding.
     """
 
     origin: Array
@@ -121,6 +123,8 @@ class PolygonGrid(struct.PyTreeNode, kw_only=True):
     cell_mask: Array
     cell_edges: Array
     masks: Array
+    edge_start: Array
+    edge_count: Array
     edges: Array
     edge_polygon: Array
 

@@ -185,8 +185,13 @@ def test_stored_programs_start_a_new_process(tmp_path: Path):
     second = child("stored", 1, tmp_path)
     assert second["stored"]
     assert second["result"] == first["result"]
-    (program,) = tmp_path.rglob("programs/*")
-    program.write_bytes(program.read_bytes()[:1000])
+    names = list(tmp_path.rglob("programs/*"))
+    assert len(names) == 2 and names[0].samefile(names[1])  # by its source, and by its text
+    by_source = next(name for name in names if "-" not in name.name)
+    by_source.unlink()
+    edited = child("stored", 1, tmp_path)  # as after a change of the source
+    assert edited["stored"] and edited["result"] == first["result"]
+    by_source.write_bytes(by_source.read_bytes()[:1000])
     third = child("stored", 1, tmp_path)  # a damaged program is made anew
     assert not third["stored"] and third["result"] == first["result"]
     other = child("stored", 1, tmp_path, "2.5")  # another setting is another program
@@ -224,7 +229,7 @@ def test_groups_hold_everybody_and_are_few(factors: list[float]):
 
 def test_a_large_scene_does_not_blow_up_the_small_ones(scenes: ScenarioSet):
     small = own_sizes(scenes)
-    large = {**small[0], "grid_cells": 8_000_000, "grid_rows": 400_000}
+    large = {**small[0], "grid_cells": 8_000_000, "grid_rows": 400_000, "grid_edges": 900_000}
     groups = group_by_shape([*small, large])
     assert [group.rows for group in groups] == [[0, 1, 2], [3]]
 

@@ -18,7 +18,7 @@ from spdm_jax.types import PolygonGrid
 
 NUM_POINTS = 600
 # Fixed sizes, so that all examples share one compiled query.
-CELLS, ROWS, SLOTS, MASKS, WORDS = 16384, 4096, 64, 256, 2
+CELLS, ROWS, EDGES, MASKS, WORDS = 16384, 4096, 32768, 256, 2
 
 _query = jax.jit(containing_polygons)
 
@@ -36,8 +36,10 @@ def padded(grid: PolygonGrid, dtype=jnp.float64) -> PolygonGrid:
         cell_mask=jnp.asarray(grown(np.asarray(grid.cell_mask), CELLS)),
         cell_edges=jnp.asarray(grown(np.asarray(grid.cell_edges), CELLS)),
         masks=jnp.asarray(grown(np.asarray(grid.masks), MASKS, WORDS)),
-        edges=jnp.asarray(grown(np.asarray(grid.edges), ROWS, SLOTS), dtype),
-        edge_polygon=jnp.asarray(grown(np.asarray(grid.edge_polygon), ROWS, SLOTS, fill=-1)),
+        edge_start=jnp.asarray(grown(np.asarray(grid.edge_start), ROWS)),
+        edge_count=jnp.asarray(grown(np.asarray(grid.edge_count), ROWS)),
+        edges=jnp.asarray(grown(np.asarray(grid.edges), EDGES), dtype),
+        edge_polygon=jnp.asarray(grown(np.asarray(grid.edge_polygon), EDGES, fill=-1)),
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import sweep_pack as packs
 from spdm_experiments.inventory import Shard, split, take_inventory
-from spdm_experiments.loading import load_scenes
+from spdm_experiments.loading import Loader
 from spdm_experiments.sweep_scene import UNREAD, Shared, Switches, read_scene
 from spdm_jax import load, spdm
 from spdm_jax.batching import group_by_shape
@@ -76,7 +76,7 @@ def test_inventory_lists_what_cannot_be_used(pack: Path, tmp_path: Path):
 def test_loading_pads_as_a_batch_does(pack: Path):
     entries = take_inventory_of(pack)
     (group,) = group_by_shape([entry.sizes for entry in entries])
-    loaded = load_scenes(entries, group.padding)
+    loaded = Loader().load(entries, group.padding)
     assert loaded.batch is not None and not loaded.failures
     scenarios, infos = zip(*(read_scenario(entry.path) for entry in entries), strict=True)
     whole = leaves_of(batch(scenarios, group.padding))
@@ -84,7 +84,7 @@ def test_loading_pads_as_a_batch_does(pack: Path):
         np.testing.assert_array_equal(leaf, whole[path], err_msg=path)
         assert leaf.dtype == whole[path].dtype
     assert loaded.track_ids == [info.track_ids for info in infos]
-    part = load_scenes(entries, group.padding, unread=UNREAD, dtype=np.float32)
+    part = Loader(unread=UNREAD, dtype=np.float32).load(entries, group.padding)
     assert part.batch is not None
     for path, leaf in leaves_of(part.batch).items():
         assert leaf.shape == whole[path].shape
@@ -120,7 +120,7 @@ def test_file_with_a_wrong_byte_fails_alone(pack: Path, tmp_path: Path):
     content[len(content) // 2] ^= 255
     entries[1].path.write_bytes(content)
     (group,) = group_by_shape([entry.sizes for entry in entries])
-    loaded = load_scenes(entries, group.padding)
+    loaded = Loader().load(entries, group.padding)
     assert [entry.token for entry in loaded.entries] == [TOKENS[0], *TOKENS[2:]]
     ((failure, entry),) = loaded.failures
     assert entry is entries[1] and "scene-01" in failure.reason

@@ -198,7 +198,7 @@ def test_interrupt_ends_the_chunk_and_the_command_goes_on(
 
 CHILD = """
 import os, signal, sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {paths!r}
 import test_label
 from spdm_experiments import cli, label_folder, label_work
 label_work.score_part = test_label.cheap_score
@@ -219,7 +219,9 @@ sys.exit(cli.main({arguments!r}))
 def test_killed_it_goes_on(suffix: str, pack: Path, vocabulary: Path, tmp_path: Path, cheap: None):
     out = tmp_path / "labels"
     arguments = ["label", str(pack), str(vocabulary), "--out", str(out), "--chunk", "2"]
-    code = CHILD.format(tests=str(Path(__file__).parent), suffix=suffix, arguments=arguments)
+    here = Path(__file__).parent
+    paths = [str(here), str(here / "helpers")]
+    code = CHILD.format(paths=paths, suffix=suffix, arguments=arguments)
     # The vocabulary is the first .npy file, so one more write comes before the end.
     child = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=dict(os.environ)

@@ -13,25 +13,35 @@ from hypothesis import strategies as st
 from random_world import world
 from spdm_jax.io.build import build_scenario, raw_map
 from spdm_jax.padding import (
+    PaddedStack,
     PaddingConfig,
     batch,
     bucket,
-    pad_scenario,
     sizes_of,
     to_device,
 )
-from spdm_jax.schema import LEAVES, leaves_of
+from spdm_jax.schema import LEAVES, from_leaves, leaves_of
 from spdm_jax.types import PolygonGrid, Scenario, ScenarioInfo
 
 AXES = sorted({axis for leaf in LEAVES.values() for axis in leaf.axes if isinstance(axis, str)})
 # The grid is the largest part of a scenario; small buckets keep these tests quick.
-SMALL = PaddingConfig(grid_cells=(1024, 4096, 16384, 65536, 262144), grid_rows=(64, 512, 4096))
+SMALL = PaddingConfig(
+    grid_cells=(1024, 4096, 16384, 65536, 262144),
+    grid_rows=(64, 512, 4096),
+    grid_edges=(64, 1024, 16384),
+)
 
 
 @pytest.fixture(scope="module")
 def built() -> list[tuple[Scenario, ScenarioInfo]]:
     raws = [world(2), world(7, blocks=2, lanes=3, agents=0), world(4, areas=0)]
     return [build_scenario(raw, margin=15.0) for raw in raws]
+
+
+def pad_scenario(scenario: Scenario, sizes: dict[str, int]) -> Scenario:
+    stack = PaddedStack(1, sizes)
+    stack.add(leaves_of(scenario), sizes_of(scenario))
+    return from_leaves({path: np.asarray(array[0]) for path, array in stack.leaves().items()})
 
 
 def polygons_at(grid: PolygonGrid, points: np.ndarray) -> list[set[int]]:
@@ -43,9 +53,11 @@ def polygons_at(grid: PolygonGrid, points: np.ndarray) -> list[set[int]]:
     for cell, center, point in zip(cells, centers, points, strict=True):
         words = grid.masks[grid.cell_mask[cell]]
         inside = {n for n in range(32 * len(words)) if words[n // 32] >> (n % 32) & 1}
-        edges = grid.edges[grid.cell_edges[cell]]
+        row = grid.cell_edges[cell]
+        own = slice(grid.edge_start[row], grid.edge_start[row] + grid.edge_count[row])
+        edges = grid.edges[own]
         way = shapely.LineString([(0, 0), point - center])
-        for edge, polygon in zip(edges, grid.edge_polygon[grid.cell_edges[cell]], strict=True):
+        for edge, polygon in zip(edges, grid.edge_polygon[own], strict=True):
             if polygon >= 0 and way.crosses(shapely.LineString(edge.reshape(2, 2))):
                 inside ^= {int(polygon)}
         found.append(inside)
@@ -89,6 +101,21 @@ def test_real_entries_are_unchanged_and_padding_is_inert(
                 rest = leaf.copy()
                 rest[real] = LEAVES[path].fill
                 assert (rest == LEAVES[path].fill).all(), path
+
+
+def test_stack_used_again_holds_nothing_of_before(built: list[tuple[Scenario, ScenarioInfo]]):
+    scenes = [scenario for scenario, _ in built]
+    most = {axis: max(sizes_of(scene)[axis] for scene in scenes) + 2 for axis in AXES}
+    stack = PaddedStack(3, most, dtype=np.float32)
+    for scene in scenes:
+        stack.add(leaves_of(scene), sizes_of(scene))
+    stack.clear()
+    stack.add(leaves_of(scenes[1]), sizes_of(scenes[1]))
+    fresh = leaves_of(pad_scenario(scenes[1], most))
+    for path, array in stack.leaves().items():
+        kind = np.float32 if fresh[path].dtype == np.float64 else fresh[path].dtype
+        assert array.shape == (1, *fresh[path].shape) and array.dtype == kind, path
+        np.testing.assert_array_equal(array[0], fresh[path].astype(kind), err_msg=path)
 
 
 def test_padding_values(built: list[tuple[Scenario, ScenarioInfo]]):

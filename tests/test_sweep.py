@@ -287,9 +287,9 @@ def test_failures_are_rows_with_reasons(
 
     load_chunk = sweep_work.load_chunk
 
-    def loading(chunk: Any, job: Any) -> Any:
+    def loading(*given: Any) -> Any:
         (copy / "scene-05.npz").write_bytes(b"gone meanwhile")
-        return load_chunk(chunk, job)
+        return load_chunk(*given)
 
     monkeypatch.setattr(Engine, "_call", not_finite)
     monkeypatch.setattr("spdm_experiments.sweep.load_chunk", loading)

@@ -174,8 +174,8 @@ def test_scenes_go_to_the_device_once(
     fresh = copy.copy(scenes)
     vars(fresh).pop("_on_devices", None)
     moved: list[int] = []
-    put = jax.device_put
-    monkeypatch.setattr(jax, "device_put", lambda v, *a: moved.append(np.size(v)) or put(v, *a))
+    put, size = jax.device_put, lambda tree: sum(np.size(v) for v in jax.tree.leaves(tree))
+    monkeypatch.setattr(jax, "device_put", lambda v, *a: moved.append(size(v)) or put(v, *a))
     torch_score(fresh, tensor[:1], TOKENS[:1])
     first = sum(moved)
     torch_score(fresh, tensor[:1], TOKENS[:1])

@@ -1,6 +1,6 @@
 """Benchmark rows that need a process of their own: first calls, peak memory, a whole sweep.
 
-`python -m spdm_experiments.bench_process MODE ARGUMENTS` prints one JSON object.
+`python -m spdm_experiments.bench_process MODE ARGUMENTS` prints one JSON object in its last line.
 """
 
 import json
@@ -8,103 +8,130 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 
-def _peak_mb() -> float:
-    """Largest resident size of this process so far, MB."""
+def peak_mb() -> float:
+    """Returns the largest resident size of this process so far, MB.
+
+    Linux hands `ru_maxrss` on from the process that started this one; its own mark is asked first.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text(encoding="utf-8").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e3 if sys.platform != "darwin" else peak / 1e6
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def first_call(planner: str, count: str) -> dict[str, Any]:
-    """Seconds of the first plan of a process, imports and scene building apart."""
+def scenes(folder: str, crossings: str, mixed: str, copies: str) -> dict[str, Any]:
+    """Packs the scenes of a run."""
+    from spdm_experiments.bench_scenes import pack_scenes
+
+    started = time.perf_counter()
+    pack_scenes(Path(folder), int(crossings), int(mixed), int(copies))
+    return {"seconds": time.perf_counter() - started}
+
+
+def first_call(folder: str, planner: str, count: str) -> dict[str, Any]:
+    """Measures the first plan of a process, imports and reading the scene apart."""
     started = time.perf_counter()
     import jax
 
-    from spdm_experiments.bench import SCENE
-    from spdm_jax import from_raw, pdm_closed, plan, spdm
+    from spdm_experiments.bench_rows import planner_of
+    from spdm_experiments.bench_scenes import scene_files
+    from spdm_jax import load, plan
     from spdm_jax.compile_cache import enable_compile_cache
-    from spdm_jax.synthetic import make_scene
 
     enable_compile_cache()
     jax.devices()
     imported = time.perf_counter() - started
-    scenes = from_raw([make_scene(*SCENE)])
-    spec = pdm_closed(int(count)) if planner == "PDM-Closed" else spdm(int(count))
+    scene = load(scene_files(Path(folder), "crossings")[0])
+    spec = planner_of(planner, int(count))
     began = time.perf_counter()
-    plan(scenes, spec)
+    plan(scene, spec)
     return {"first_call_s": time.perf_counter() - began, "import_s": imported}
 
 
-def memory(kind: str, count: str) -> dict[str, Any]:
-    """Peak memory of scoring `count` trajectories, or of planning `count` scenes as packed files.
+def memory(folder: str, kind: str, count: str) -> dict[str, Any]:
+    """Measures the peak memory of scoring trajectories in one scene, or of `spdm sweep`.
 
     Programs come from the compile cache where they are there: compiling them is no part of a run.
     """
-    from spdm_experiments.bench import SCENE, fan
-    from spdm_jax import from_raw, load, plan, score, spdm
+    from spdm_experiments import cli
+    from spdm_experiments.bench_rows import fan
+    from spdm_experiments.bench_scenes import scene_files
+    from spdm_jax import load, score
     from spdm_jax.compile_cache import enable_compile_cache
-    from spdm_jax.synthetic import make_scene
 
     enable_compile_cache()
+    before = peak_mb()
     if kind == "trajectories":
-        scenes = from_raw([make_scene(*SCENE)])
-        before = _peak_mb()
-        score(scenes, fan(int(count)))
-        return {"before_mb": before, "peak_mb": _peak_mb()}
-    with tempfile.TemporaryDirectory() as folder:
-        padding = pack(int(count), Path(folder))
-        files = sorted(Path(folder).glob("*.npz"))
-        before = _peak_mb()
-        for begin in range(0, len(files), 16):
-            plan(load(files[begin : begin + 16], padding=padding), spdm(60))
-        return {"before_mb": before, "peak_mb": _peak_mb()}
+        score(load(scene_files(Path(folder), "crossings")[0]), fan(int(count)))
+    else:
+        with tempfile.TemporaryDirectory() as base:
+            _sweep(cli.main, Path(folder, "many"), Path(base, "run"), int(count))
+    return {"before_mb": before, "peak_mb": peak_mb()}
 
 
-def pack(count: int, folder: Path) -> Any:
-    """Packs `count` built-in scenes and returns the padding that holds them all."""
-    from spdm_experiments.bench import NAMES
-    from spdm_experiments.inventory import take_inventory
-    from spdm_jax.batching import group_by_shape
-    from spdm_jax.io.pack import pack as pack_reader
-    from spdm_jax.synthetic import SyntheticReader
+def sweep(folder: str, count: str, repetitions: str) -> dict[str, Any]:
+    """Measures `spdm sweep` of SPDM 60 over packed scenes, next to the time of its kernels.
 
-    seeds = range(-(-count // len(NAMES)))
-    pack_reader(SyntheticReader(NAMES[: min(count, len(NAMES))], seeds), folder)
-    entries = take_inventory(sorted(folder.glob("*.npz"))).entries
-    return group_by_shape([entry.sizes for entry in entries])[-1].padding
+    Returns:
+      Medians over the runs after the first, ms per scenario. The kernel's time is what the library
+      takes from padded scenarios on the host to results on the host.
+    """
+    import numpy as np
 
-
-def sweep(count: str) -> dict[str, Any]:
-    """A sweep of SPDM 60 over packed scenes, end to end, next to the time of its kernels."""
     from spdm_experiments import cli
+    from spdm_experiments.bench_rows import Stopwatch
 
+    watch, runs = Stopwatch(int(repetitions)), []
     with tempfile.TemporaryDirectory() as base:
-        packed = Path(base, "packed")
-        packed.mkdir()
-        pack(int(count), packed)
-        walls = []
-        for run in ("first", "second", "third", "fourth"):
-            started = time.perf_counter()
-            code = cli.main(
-                ["sweep", str(packed), "--num-proposals", "60", "--out", str(Path(base, run))]
-            )
-            walls.append(time.perf_counter() - started)
-            if code:
-                raise RuntimeError(f"sweep ended with {code}")
-        text = Path(base, "fourth", "progress-all.json").read_text(encoding="utf-8")
-        work = json.loads(text)["sessions"][-1]
+        for number in range(1 + int(repetitions)):
+            stick, out = watch.yardstick(), Path(base, str(number))
+            started, cpu = time.perf_counter(), time.process_time()
+            _sweep(cli.main, Path(folder, "many"), out, int(count))
+            wall, used = time.perf_counter() - started, time.process_time() - cpu
+            text = (out / "progress-all.json").read_text(encoding="utf-8")
+            work = json.loads(text)["sessions"][-1]
+            seconds = {name: work[f"{name}_s"] for name in ("load", "compile", "run", "write")}
+            runs.append({"wall": wall, "cpu": used, "stick": stick, **seconds})
+    first, *warm = runs
+    each = {
+        name: 1e3 * float(np.median([run[name] for run in warm])) / int(count)
+        for name in ("wall", "cpu", "load", "run", "write")
+    }
     return {
         "scenes": int(count),
-        "end_to_end_ms": 1e3 * min(walls[1:]) / int(count),
-        "kernel_ms": 1e3 * work["run_s"] / int(count),
-        "load_ms": 1e3 * work["load_s"] / int(count),
+        "first_run_s": first["wall"],
+        "end_to_end_ms": each["wall"],
+        "kernel_ms": each["run"],
+        "load_ms": each["load"],
+        "write_ms": each["write"],
+        "cpu_ms": each["cpu"],
+        "ratio": float(np.median([run["wall"] / run["run"] for run in warm])),
+        "yardstick_ms": 1e3 * float(np.median([run["stick"] for run in warm])),
+        "repetitions": int(repetitions),
     }
 
 
+def _sweep(run: Callable[[list[str]], int], folder: Path, out: Path, count: int) -> None:
+    options = ["--num-proposals", "60", "--limit", str(count), "--out", str(out)]
+    if code := run(["sweep", str(folder), *options]):
+        raise RuntimeError(f"sweep ended with {code}")
+
+
+MODES: dict[str, Callable[..., dict[str, Any]]] = {
+    "scenes": scenes,
+    "first_call": first_call,
+    "memory": memory,
+    "sweep": sweep,
+}
+
 if __name__ == "__main__":
     mode, *arguments = sys.argv[1:]
-    found = {"first_call": first_call, "memory": memory, "sweep": sweep}[mode](*arguments)
-    print(json.dumps(found))
+    print(json.dumps(MODES[mode](*arguments)))

@@ -349,7 +349,8 @@ def _settle(figure: Figure) -> None:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axes in figure.axes:
-        axes.set_position(tuple(round(edge, 6) for edge in axes.get_position().bounds))
+        left, bottom, width, height = (round(v, 6) for v in axes.get_position().bounds)
+        axes.set_position((left, bottom, width, height))
 
 
 def _save(figure: Figure, path: Path) -> Path:

@@ -5,38 +5,35 @@ per axis and the route take a tenth of that. What is read here is checked later,
 is loaded.
 """
 
-import dataclasses
-import functools
 import hashlib
-import io
 import json
-import struct
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from spdm_jax import Failure
+from spdm_jax.io.archive import (
+    DAMAGE,
+    METADATA,
+    array_header,
+    members_of,
+    stored_array,
+    unpack,
+)
 from spdm_jax.io.raw import ScenarioError
-from spdm_jax.padding import PATH_ROOM, PaddingConfig
+from spdm_jax.padding import AXES, PATH_ROOM, PaddingConfig
 from spdm_jax.schema import LEAVES
 
-METADATA = "metadata.json"
-"""Member that says in words what the file holds."""
 _COUNT = "map.lanes.centerline.count"
 _SEQUENCES = ("route.centerline_lanes", "route.goal_lanes", "route.branch_lanes")
-_AXES = tuple(field.name for field in dataclasses.fields(PaddingConfig))
-_LEAF_OF = {axis: next(p for p, leaf in LEAVES.items() if axis in leaf.axes) for axis in _AXES}
+_LEAF_OF = {axis: next(p for p, leaf in LEAVES.items() if axis in leaf.axes) for axis in AXES}
 """A leaf that has the axis."""
 _HEADER = 256
 """Bytes that hold the header of any array of a scenario file."""
-_LOCAL_HEADER = struct.Struct("<26xHH")
-DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, KeyError, TypeError, EOFError)
-"""What damaged files raise."""
+UNREADABLE = (*DAMAGE, ValueError, LookupError, TypeError)
+"""What files raise that are damaged or no scenario files."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +114,12 @@ def _look(path: Path) -> tuple[Entry, bytes]:
             members = members_of(file)
             info = json.loads(unpack(file, members[METADATA]))["info"]
             sizes: dict[str, int] = {}
-            for axis in _AXES:
+            for axis in AXES:
                 leaf = _LEAF_OF[axis]
                 shape = array_header(unpack(file, members[f"{leaf}.npy"], _HEADER))[0]
-                sizes |= {a: n for a, n in zip(LEAVES[leaf].axes, shape, strict=True) if a in _AXES}
+                sizes |= {a: n for a, n in zip(LEAVES[leaf].axes, shape, strict=True) if a in AXES}
             count, *sequences = (
-                np.load(io.BytesIO(unpack(file, members[f"{name}.npy"])), allow_pickle=False)
-                for name in (_COUNT, *_SEQUENCES)
+                stored_array(file, members[f"{name}.npy"]) for name in (_COUNT, *_SEQUENCES)
             )
         count = np.append(count, 0)  # the appended entry serves -1
         points = max((int(count[s].sum(axis=1).max()) for s in sequences if len(s)), default=0)
@@ -137,7 +133,7 @@ def _look(path: Path) -> tuple[Entry, bytes]:
             sizes=sizes,
             route_points=points,
         )
-    except (*DAMAGE, IndexError) as error:
+    except UNREADABLE as error:
         raise ScenarioError(
             f"{path}: damaged scenario file ({error}); pack this scenario again"
         ) from error
@@ -146,54 +142,8 @@ def _look(path: Path) -> tuple[Entry, bytes]:
     return entry, hashlib.sha256(repr(contents).encode()).digest()
 
 
-def members_of(file: BinaryIO) -> dict[str, zipfile.ZipInfo]:
-    """Returns the table of contents of a scenario file."""
-    with zipfile.ZipFile(file) as archive:
-        return {member.filename: member for member in archive.infolist()}
-
-
-def unpack(file: BinaryIO, member: zipfile.ZipInfo, limit: int | None = None) -> bytes:
-    """Returns a member's content, or its first bytes; `zipfile` takes longer for small ones."""
-    file.seek(member.header_offset)
-    name, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
-    file.seek(name + extra, io.SEEK_CUR)
-    size = member.compress_size if limit is None else min(member.compress_size, 4 * limit)
-    content = file.read(size)
-    if member.compress_type == zipfile.ZIP_DEFLATED:
-        content = zlib.decompressobj(-zlib.MAX_WBITS).decompress(content, limit or 0)
-    return content
-
-
-def array_header(content: bytes) -> tuple[tuple[int, ...], np.dtype, int]:
-    """Reads the header of a stored array.
-
-    Args:
-      content: its first bytes.
-
-    Returns:
-      Shape, type, and where the values begin.
-
-    Raises:
-      ValueError: that is no array, or one in Fortran order.
-    """
-    # magic string, version, length of the text that follows
-    size = 10 + int.from_bytes(content[8:10], "little")
-    return _parse_header(content[:size])
-
-
-@functools.lru_cache(maxsize=4096)
-def _parse_header(header: bytes) -> tuple[tuple[int, ...], np.dtype, int]:
-    file = io.BytesIO(header)
-    if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError("array header of another version")
-    shape, fortran, kind = np.lib.format.read_array_header_1_0(file)
-    if fortran:
-        raise ValueError("array in Fortran order")
-    return shape, kind, file.tell()
-
-
 def _check_sizes(entry: Entry, allowed: PaddingConfig) -> None:
-    for axis in _AXES:
+    for axis in AXES:
         largest = max(getattr(allowed, axis))
         if entry.sizes[axis] > largest:
             raise ScenarioError(

@@ -238,6 +238,7 @@ def _work(
             mine, index = labeller.score(piece)
             labels.append(mine)
             rows += index
+            piece.scenes.release()
             tally.load_s += piece.seconds
             if piece.last:
                 started = time.perf_counter()

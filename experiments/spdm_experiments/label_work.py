@@ -9,7 +9,7 @@ import numpy as np
 
 from spdm_experiments.inventory import Entry, split
 from spdm_experiments.label_scene import Part, Scored, Switches, join, place, score_part
-from spdm_experiments.loading import LoadedScenes, load_scenes
+from spdm_experiments.loading import LoadedScenes, Loader
 from spdm_experiments.record import REASONS
 from spdm_experiments.sweep_scene import UNREAD
 from spdm_jax import Failure, PlannerParams
@@ -108,13 +108,14 @@ class Labeller:
 
     def load(self, chunks: Sequence[Chunk]) -> Iterator[Piece]:
         """Reads scenes and brings the vocabulary to them."""
+        # float64, so that trajectories are placed as `spdm score` places them.
+        loader = Loader(unread=UNREAD)
         for chunk in chunks:
             runs = split(len(chunk.entries), chunk.group.piece)
             for run in runs:
                 started = time.perf_counter()
                 entries = [chunk.entries[i] for i in run]
-                # float64, so that trajectories are placed as `spdm score` places them.
-                scenes = load_scenes(entries, chunk.group.padding, unread=UNREAD)
+                scenes = loader.load(entries, chunk.group.padding)
                 parts = None if scenes.batch is None else self._parts(scenes.batch, chunk)
                 seconds = time.perf_counter() - started
                 yield Piece(chunk, run is runs[-1], scenes, parts, seconds)

@@ -7,17 +7,17 @@ are checked (type, shape, check sum) as `read_scenario` does.
 
 import io
 import json
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from spdm_experiments.inventory import DAMAGE, METADATA, Entry, array_header, members_of, unpack
+from spdm_experiments.inventory import UNREADABLE, Entry
 from spdm_jax import Failure
+from spdm_jax.io.archive import METADATA, members_of, stored_array, unpack
 from spdm_jax.io.raw import ScenarioError
-from spdm_jax.padding import PaddingConfig, pad_scenario
-from spdm_jax.schema import LEAVES, from_leaves, leaves_of
+from spdm_jax.padding import PaddedStack, PaddingConfig
+from spdm_jax.schema import KINDS, LEAVES, from_leaves
 from spdm_jax.types import ScenarioBatch
 
 
@@ -31,6 +31,7 @@ class LoadedScenes:
       track_ids: `[B]` source ids of their tracks.
       origins: `[B, 2]` of their local frames.
       failures: the other files, and why.
+      release: gives the memory of `batch` back to the loader, once nobody reads it any more.
     """
 
     batch: ScenarioBatch | None
@@ -38,71 +39,66 @@ class LoadedScenes:
     track_ids: list[tuple[str, ...]]
     origins: np.ndarray
     failures: list[tuple[Failure, Entry]]
+    release: Callable[[], None] = lambda: None
 
 
-def load_scenes(
-    entries: Sequence[Entry],
-    padding: PaddingConfig,
-    *,
-    unread: Sequence[str] = (),
-    dtype: np.dtype | type = np.float64,
-) -> LoadedScenes:
-    """Reads and pads scenario files; one that cannot be used is a failure, not an error.
+class Loader:
+    """Reads and pads scenario files into memory that is used again.
+
+    Fresh memory is expensive: a chunk would take as long to get it from the system as to fill it.
 
     Args:
-      entries: files, which must be as they were at the inventory.
-      padding: one size per axis.
       unread: prefixes of field paths that nobody will read; they become zeros.
       dtype: of floating leaves.
     """
-    skipped = [path for path in LEAVES if path.startswith(tuple(unread))] if unread else []
-    needed = [path for path in LEAVES if path not in skipped]
-    used_axes = {axis for path in needed for axis in LEAVES[path].axes}
-    full = {axis: sizes[0] for axis, sizes in vars(padding).items()}
-    # Axes that only unread layers have are not worth padding.
-    sizes = {axis: size if axis in used_axes else 0 for axis, size in full.items()}
-    loaded = LoadedScenes(None, [], [], np.zeros((0, 2)), [])
-    padded: list[dict[str, np.ndarray]] = []
-    origins = []
-    for entry in entries:
-        try:
-            leaves, track_ids = _read(entry, needed)
-            present = {axis: n if axis in used_axes else 0 for axis, n in entry.sizes.items()}
-            present["grid_words"] = leaves["map.grid.masks"].shape[1]
-            for path in skipped:
-                shape = [n if isinstance(n, int) else present[n] for n in LEAVES[path].axes]
-                leaves[path] = np.zeros(shape, LEAVES[path].dtype)
-            scenario = pad_scenario(from_leaves(leaves), sizes)
-        except (ValueError, OSError) as error:
-            loaded.failures.append((Failure(entry.token, str(error)), entry))
-            continue
-        padded.append(leaves_of(scenario))
-        origins.append(leaves["origin"])
-        loaded.entries.append(entry)
-        loaded.track_ids.append(track_ids)
-    if padded:
-        loaded.batch = from_leaves(_stack(padded, needed, full, np.dtype(dtype)))
-        loaded.origins = np.stack(origins)
-    return loaded
 
+    def __init__(self, *, unread: Sequence[str] = (), dtype: type[np.floating] = np.float64):
+        self._needed = [path for path in LEAVES if not path.startswith(tuple(unread))]
+        self._dtype = dtype
+        self._spare: dict[PaddingConfig, list[tuple[int, PaddedStack]]] = {}
 
-def _stack(
-    padded: Sequence[Mapping[str, np.ndarray]],
-    needed: Sequence[str],
-    full: Mapping[str, int],
-    dtype: np.dtype,
-) -> dict[str, np.ndarray]:
-    stacked: dict[str, np.ndarray] = {}
-    for path, leaf in LEAVES.items():
-        kind = np.dtype(leaf.dtype)
-        kind = dtype if np.issubdtype(kind, np.floating) else kind
-        if path in needed:
-            parts = [leaves[path] for leaves in padded]
-            stacked[path] = np.stack(parts, dtype=kind, casting="same_kind")
-        else:
-            shape = (n if isinstance(n, int) else full[n] for n in leaf.axes)
-            stacked[path] = np.broadcast_to(np.zeros((), kind), (len(padded), *shape))
-    return stacked
+    def load(self, entries: Sequence[Entry], padding: PaddingConfig) -> LoadedScenes:
+        """Reads files; one that cannot be used is a failure, not an error.
+
+        Args:
+          entries: files, which must be as they were at the inventory.
+          padding: one size per axis.
+        """
+        sizes = {axis: rooms[0] for axis, rooms in vars(padding).items()}
+        room, stack = self._stack(len(entries), padding, sizes)
+        loaded = LoadedScenes(None, [], [], np.zeros((0, 2)), [])
+        origins: list[np.ndarray] = []
+        for entry in entries:
+            try:
+                leaves, track_ids = _read(entry, self._needed)
+                stack.add(leaves, entry.sizes)
+            except (ValueError, OSError) as error:
+                loaded.failures.append((Failure(entry.token, str(error)), entry))
+                continue
+            origins.append(leaves["origin"])
+            loaded.entries.append(entry)
+            loaded.track_ids.append(track_ids)
+        loaded.release = lambda: self._spare.get(padding, []).append((room, stack))
+        if origins:
+            stacked = stack.leaves()
+            for path in LEAVES.keys() - stacked.keys():
+                shape = (n if isinstance(n, int) else sizes[n] for n in LEAVES[path].axes)
+                stacked[path] = np.broadcast_to(np.zeros((), KINDS[path]), (len(origins), *shape))
+            loaded.batch = from_leaves(stacked)
+            loaded.origins = np.stack(origins)
+        return loaded
+
+    def _stack(
+        self, count: int, padding: PaddingConfig, sizes: dict[str, int]
+    ) -> tuple[int, PaddedStack]:
+        if padding not in self._spare:
+            self._spare = {padding: []}  # one shape after the other
+        if self._spare[padding]:
+            room, stack = self._spare[padding].pop()
+            if room >= count:
+                stack.clear()
+                return room, stack
+        return count, PaddedStack(count, sizes, paths=self._needed, dtype=self._dtype)
 
 
 def _read(entry: Entry, needed: Sequence[str]) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
@@ -113,23 +109,15 @@ def _read(entry: Entry, needed: Sequence[str]) -> tuple[dict[str, np.ndarray], t
     """
     path = entry.path
     try:
-        content = path.read_bytes()
-        members = members_of(io.BytesIO(content))
-        file = io.BytesIO(content)
+        file = io.BytesIO(path.read_bytes())
+        members = members_of(file)
         info = json.loads(unpack(file, members[METADATA]))["info"]
         leaves: dict[str, np.ndarray] = {}
         for name in needed:
-            member = members[f"{name}.npy"]
-            raw = unpack(file, member)
-            if zlib.crc32(raw) != member.CRC:
-                raise ScenarioError(
-                    f"{path}: field {name}: wrong check sum; pack this scenario again"
-                )
-            shape, kind, begin = array_header(raw[:256])
-            leaves[name] = np.frombuffer(raw, kind, offset=begin).reshape(shape)
-            if kind != np.dtype(LEAVES[name].dtype) or not _fits(shape, name, entry):
+            leaf = leaves[name] = stored_array(file, members[f"{name}.npy"])
+            if leaf.dtype != KINDS[name] or not _fits(leaf.shape, name, entry):
                 raise ScenarioError(f"{path}: field {name}: changed while it was in use")
-    except DAMAGE as error:
+    except UNREADABLE as error:
         if isinstance(error, ScenarioError):
             raise
         raise ScenarioError(

@@ -33,6 +33,7 @@ from spdm_experiments.sweep_work import (
     Group,
     Job,
     load_chunk,
+    loader_of,
     outcome,
 )
 from spdm_experiments.tables import console
@@ -48,7 +49,7 @@ from spdm_jax.batching import (
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.padding import PATH_ROOM, bucket
 
-MEMORY = {"cpu": 128 * 2**20, "gpu": 512 * 2**20}
+MEMORY = {"cpu": 64 * 2**20, "gpu": 512 * 2**20}
 """Bytes that the scenarios of one chunk may take; three chunks are in memory at a time."""
 MAX_CHUNK = 64
 """Scenarios of a chunk at most, so that little is lost with it."""
@@ -161,8 +162,8 @@ class Local:
 
     def run(self, job: Job, chunks: Sequence[Chunk], stop: Callable[[], bool]) -> Iterator[Done]:
         """Computes chunks until all are done or the user wants to stop."""
-        engine = Engine(job)
-        loads = prefetch(load_chunk(chunk, job) for chunk in chunks)
+        engine, loader = Engine(job), loader_of(job)
+        loads = prefetch(load_chunk(chunk, job, loader) for chunk in chunks)
         for loaded in loads:
             yield engine.process(loaded)
             if stop():

@@ -12,15 +12,18 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from spdm_experiments.loading import Loader
 from spdm_experiments.options import Sweep
 from spdm_experiments.runtime import configure_jax, provenance
-from spdm_experiments.sweep_work import Chunk, Done, Engine, Job, load_chunk
+from spdm_experiments.sweep_work import Chunk, Done, Engine, Job, load_chunk, loader_of
 from spdm_jax.batching import BatchConfig
 
 RETRIES = 5
 """How often a chunk is tried again after its worker was lost."""
 _engines: dict[str, Engine] = {}
 """In a worker: the engine of the sweep at hand, which keeps its compiled programs."""
+_loaders: dict[str, Loader] = {}
+"""In a worker: what reads for that engine."""
 
 
 class Cluster:
@@ -126,7 +129,9 @@ def run_chunk(key: str, options: Sweep, job: Job, chunk: Chunk) -> Done:
         _engines.clear()
         threads = BatchConfig(devices=1, threads=1)
         _engines[key] = Engine(dataclasses.replace(job, batching=threads))
-    return _engines[key].process(load_chunk(chunk, job))
+        _loaders.clear()
+        _loaders[key] = loader_of(job)
+    return _engines[key].process(load_chunk(chunk, job, _loaders[key]))
 
 
 def about(options: Sweep) -> dict[str, object]:

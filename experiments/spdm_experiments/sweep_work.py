@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from spdm_experiments.inventory import Entry
-from spdm_experiments.loading import LoadedScenes, load_scenes
+from spdm_experiments.loading import LoadedScenes, Loader
 from spdm_experiments.parts import part_name
 from spdm_experiments.run_folder import write_part
 from spdm_experiments.sweep_grid import Run
@@ -115,12 +115,15 @@ class Done:
     messages: list[str] = field(default_factory=list)
 
 
-def load_chunk(chunk: Chunk, job: Job) -> Loaded:
+def loader_of(job: Job) -> Loader:
+    """Returns what reads the scenarios of a job."""
+    return Loader(unread=UNREAD, dtype=np.float64 if job.precision == "f64" else np.float32)
+
+
+def load_chunk(chunk: Chunk, job: Job, loader: Loader) -> Loaded:
     """Reads the files of a chunk."""
     started = time.perf_counter()
-    dtype = np.float64 if job.precision == "f64" else np.float32
-    padding = job.groups[chunk.group].padding
-    scenes = load_scenes(chunk.entries, padding, unread=UNREAD, dtype=dtype)
+    scenes = loader.load(chunk.entries, job.groups[chunk.group].padding)
     return Loaded(chunk, scenes, time.perf_counter() - started)
 
 
@@ -151,6 +154,7 @@ class Engine:
             if job.trajectories:
                 tokens = [entry.token for entry in scenes.entries]
                 poses.append(poses_of(reading, tokens, run.points, scenes.origins))
+        scenes.release()
         order = {entry.token: i for i, entry in enumerate(chunk.entries)}
         rows.sort(key=lambda row: (order[row["token"]], row["point"]))
         started = time.perf_counter()

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,9 @@ import numpy as np
 from flax import struct
 
 from spdm_experiments.chunks import scenario_files, suite_name
-from spdm_experiments.inventory import (
-    DAMAGE,
-    METADATA,
-    Entry,
-    Inventory,
-    split,
-    take_inventory,
-)
+from spdm_experiments.inventory import UNREADABLE, Entry, Inventory, split, take_inventory
 from spdm_experiments.label_folder import digest
-from spdm_experiments.loading import load_scenes
+from spdm_experiments.loading import Loader
 from spdm_experiments.options import Vocab
 from spdm_experiments.record import REASONS
 from spdm_experiments.runtime import configure_jax, now, provenance
@@ -32,6 +26,7 @@ from spdm_experiments.terminal import print_files, progress_line, reasons
 from spdm_jax import planner, spdm
 from spdm_jax.batching import SceneRunner, group_by_shape, padded_bytes, prefetch
 from spdm_jax.config import NUM_STATES, PlannerConfig, PlannerParams
+from spdm_jax.io.archive import METADATA, members_of, stored_array, unpack
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.io.scenario_file import write_atomically
 from spdm_jax.padding import PATH_ROOM, bucket
@@ -143,7 +138,7 @@ def _futures(inventory: Inventory, failed: dict[str, str]) -> Iterator[np.ndarra
     for entry in inventory.entries:
         try:
             ego, valid, time_us = _read_ego(entry)
-        except DAMAGE as error:
+        except UNREADABLE as error:
             failed[entry.token] = f"{entry.path}: damaged scenario file ({error}); pack it again"
             yield np.zeros((0, NUM_STATES, 3))
             continue
@@ -158,11 +153,13 @@ def _futures(inventory: Inventory, failed: dict[str, str]) -> Iterator[np.ndarra
 
 def _read_ego(entry: Entry) -> tuple[EgoState, np.ndarray, np.ndarray]:
     """Returns the recorded ego, its validity and the source's clock in microseconds."""
-    with np.load(entry.path, allow_pickle=False) as file:
-        ego = EgoState(**{name: file[f"ego.{name}"] for name in STATE_COLUMNS})
-        began = json.loads(file[METADATA])["info"]["iteration0_time_us"]
-        time_us = began + np.rint(1e6 * file["time"]).astype(np.int64)
-        return ego, file["ego_valid"], time_us
+    file = io.BytesIO(entry.path.read_bytes())
+    members = members_of(file)
+    read = lambda name: stored_array(file, members[f"{name}.npy"])
+    ego = EgoState(**{name: read(f"ego.{name}") for name in STATE_COLUMNS})
+    began = json.loads(unpack(file, members[METADATA]))["info"]["iteration0_time_us"]
+    time_us = began + np.rint(1e6 * read("time")).astype(np.int64)
+    return ego, read("ego_valid"), time_us
 
 
 class Tracked(struct.PyTreeNode, kw_only=True):
@@ -204,16 +201,16 @@ def _proposals(
         run = SceneRunner(track_proposals, config, precision=options.precision)
         each = padded_bytes({axis: sizes[0] for axis, sizes in vars(group.padding).items()})
         runs = split(len(entries), max(1, MEMORY // each))
-        load = lambda rows, g=group, e=entries: load_scenes(
-            [e[i] for i in rows], g.padding, unread=UNREAD
-        )
-        for scenes in prefetch(map(load, runs)):
+        loader, padding = Loader(unread=UNREAD), group.padding
+        parts = [[entries[i] for i in rows] for rows in runs]
+        for scenes in prefetch(map(loader.load, parts, repeat(padding))):
             for failure, _ in scenes.failures:
                 failed[failure.token] = failure.reason
                 yield np.zeros((0, NUM_STATES, 3))
             if scenes.batch is None:
                 continue
             found = run(scenes.batch, None, spec.params)
+            scenes.release()
             for row, entry in enumerate(scenes.entries):
                 poses = found.poses[row][found.valid[row]]
                 finite = np.isfinite(poses).all()

@@ -119,15 +119,10 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
 
     cell_edges = np.zeros(nx * ny, np.int32)
     cells, first, counts = np.unique(pairs[:, 0], return_index=True, return_counts=True)
-    slots = int(counts.max()) if len(counts) else 1
-    table = np.zeros((len(cells) + 1, slots, 4))
-    owner = np.full((len(cells) + 1, slots), -1, np.int32)
-    if len(cells):
-        row = np.repeat(np.arange(1, len(cells) + 1), counts)
-        slot = np.arange(len(pairs)) - np.repeat(first, counts)
-        table[row, slot] = edges[pairs[:, 1]] - np.tile(centers[pairs[:, 0]], 2)
-        owner[row, slot] = rows[pairs[:, 1]]
-        cell_edges[cells] = np.arange(1, len(cells) + 1)
+    cell_edges[cells] = np.arange(1, len(cells) + 1)
+    table, owner = edges[pairs[:, 1]] - np.tile(centers[pairs[:, 0]], 2), rows[pairs[:, 1]]
+    if not len(pairs):  # there is something to index, though nobody does
+        table, owner = np.zeros((1, 4)), np.array([-1])
     return PolygonGrid(
         origin=np.asarray(origin, float),
         cell_size=np.asarray(size, float),
@@ -135,8 +130,10 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
         cell_mask=cell_mask.reshape(-1).astype(np.int32),
         cell_edges=cell_edges,
         masks=unique,
+        edge_start=np.append(0, first).astype(np.int32),
+        edge_count=np.append(0, counts).astype(np.int32),
         edges=table,
-        edge_polygon=owner,
+        edge_polygon=owner.astype(np.int32),
     )
 
 

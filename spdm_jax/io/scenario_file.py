@@ -9,26 +9,22 @@ import dataclasses
 import io
 import json
 import os
-import struct
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from spdm_jax import __version__
+from spdm_jax.io.archive import DAMAGE, METADATA, stored_array
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.schema import LEAVES, check_leaves, from_leaves, leaves_of
 from spdm_jax.types import SCHEMA_VERSION, Scenario, ScenarioInfo
 
-_METADATA = "metadata.json"
 _ARRAY = ".npy"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # zip's earliest time stamp
 _COMPRESSION_LEVEL = 1  # the grid shrinks to a twentieth, higher levels gain little and are slow
-_DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)
-"""What `zipfile` raises on damaged archives."""
 _ROW_IDS = {
     "lane_ids": "lanes",
     "roadblock_ids": "roadblocks",
@@ -60,7 +56,7 @@ def read_scenario(path: str | os.PathLike[str]) -> tuple[Scenario, ScenarioInfo]
     """Reads a scenario file.
 
     Returns:
-      Scenario with NumPy leaves, bit for bit as written, and its description.
+      Scenario with NumPy leaves (read-only), bit for bit as written, and its description.
 
     Raises:
       ScenarioError: the file is damaged or of another layout; names file, field and value.
@@ -68,10 +64,13 @@ def read_scenario(path: str | os.PathLike[str]) -> tuple[Scenario, ScenarioInfo]
     """
     path = Path(path)
     try:
-        with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+        # Whole: a hundred small members are read faster from memory.
+        file = io.BytesIO(path.read_bytes())
+        with zipfile.ZipFile(file) as archive:
             info = _read_info(path, archive)
-            leaves = {name: _read_array(path, archive, name) for name in LEAVES}
-    except _DAMAGE as error:
+            members = {name: archive.getinfo(name + _ARRAY) for name in LEAVES}
+        leaves = {name: _read_array(path, file, name, m) for name, m in members.items()}
+    except DAMAGE as error:
         raise ScenarioError(
             f"{path}: damaged scenario file ({error}); pack this scenario again"
         ) from error
@@ -85,7 +84,7 @@ def is_complete(path: str | os.PathLike[str], token: str) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return _read_info(path, archive).token == token
-    except (OSError, ScenarioError, *_DAMAGE):
+    except (OSError, ScenarioError, *DAMAGE):
         return False
 
 
@@ -111,7 +110,7 @@ def _encode(leaves: Mapping[str, np.ndarray], info: ScenarioInfo) -> bytes:
     }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        _add(archive, _METADATA, json.dumps(metadata, sort_keys=True, indent=1).encode())
+        _add(archive, METADATA, json.dumps(metadata, sort_keys=True, indent=1).encode())
         for name, leaf in leaves.items():
             array = io.BytesIO()
             np.lib.format.write_array(array, np.require(leaf, requirements="C"), allow_pickle=False)
@@ -130,20 +129,20 @@ def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
 def _read_info(path: Path, archive: zipfile.ZipFile) -> ScenarioInfo:
     """Reads the metadata after a check of the version and of the list of members."""
     members = archive.namelist()
-    if _METADATA not in members:
-        raise ScenarioError(f"{path}: no {_METADATA}; this is not a scenario file")
+    if METADATA not in members:
+        raise ScenarioError(f"{path}: no {METADATA}; this is not a scenario file")
     try:
-        metadata = json.loads(archive.read(_METADATA))
+        metadata = json.loads(archive.read(METADATA))
         version = metadata["schema_version"]
         entries = metadata["info"]
     except (ValueError, KeyError, TypeError) as error:
-        raise ScenarioError(f"{path}: {_METADATA} is not readable ({error!r})") from error
+        raise ScenarioError(f"{path}: {METADATA} is not readable ({error!r})") from error
     if version != SCHEMA_VERSION:
         raise ScenarioError(
             f"{path}: schema_version is {version!r}, this library reads {SCHEMA_VERSION}; pack the "
             "scenarios again"
         )
-    expected = {_METADATA, *(name + _ARRAY for name in LEAVES)}
+    expected = {METADATA, *(name + _ARRAY for name in LEAVES)}
     if set(members) != expected or len(members) != len(expected):
         missing = sorted(expected - set(members))
         extra = sorted(set(members) - expected)
@@ -170,15 +169,11 @@ def _parse_info(path: Path, entries: Any) -> ScenarioInfo:
     return ScenarioInfo(**values)
 
 
-def _read_array(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    content = io.BytesIO(archive.read(name + _ARRAY))
+def _read_array(path: Path, file: BinaryIO, name: str, member: zipfile.ZipInfo) -> np.ndarray:
     try:
-        array = np.lib.format.read_array(content, allow_pickle=False)
+        return stored_array(file, member)
     except ValueError as error:
         raise ScenarioError(f"{path}: field {name} is not a plain array ({error})") from error
-    if content.read(1):
-        raise ScenarioError(f"{path}: field {name} has bytes after the array's end")
-    return array
 
 
 def _check(path: Path, leaves: Mapping[str, np.ndarray], info: ScenarioInfo) -> None:

@@ -68,23 +68,23 @@ def containing_polygons(grid: PolygonGrid, x: jax.Array, y: jax.Array) -> tuple[
     num_words = grid.masks.shape[1]
     words = [jnp.where(inside, grid.masks[mask_row, w], jnp.uint32(0)) for w in range(num_words)]
 
-    def flip(slot, words):
-        ax, ay = grid.edges[edge_row, slot, 0], grid.edges[edge_row, slot, 1]
-        bx, by = grid.edges[edge_row, slot, 2], grid.edges[edge_row, slot, 3]
-        polygon = grid.edge_polygon[edge_row, slot]
+    first, count = grid.edge_start[edge_row], grid.edge_count[edge_row]
+
+    def flip(number, words):
+        edge = first + number
+        ax, ay, bx, by = (grid.edges[edge, k] for k in range(4))
+        polygon = grid.edge_polygon[edge]
         # The segment runs from the cell centre (0, 0) to (px, py).
         ends_apart = (px * ay - py * ax > 0) != (px * by - py * bx > 0)
         ex, ey = bx - ax, by - ay
         points_apart = (ey * ax - ex * ay > 0) != (ex * (py - ay) - ey * (px - ax) > 0)
-        bit = jnp.where(ends_apart & points_apart, jnp.uint32(1), jnp.uint32(0)) << (
-            polygon & 31
-        ).astype(jnp.uint32)
+        crossed = ends_apart & points_apart & (number < count)
+        bit = jnp.where(crossed, jnp.uint32(1), jnp.uint32(0)) << (polygon & 31).astype(jnp.uint32)
         word = polygon >> 5
         return tuple(v ^ jnp.where(word == w, bit, jnp.uint32(0)) for w, v in enumerate(words))
 
-    # Edges come first in their row, so the fullest cell that was hit bounds the work.
-    filled = jnp.sum(grid.edge_polygon >= 0, axis=1, dtype=jnp.int32)
-    return jax.lax.fori_loop(jnp.int32(0), jnp.max(filled[edge_row]), flip, tuple(words))
+    # The fullest cell that was hit bounds the work.
+    return jax.lax.fori_loop(jnp.int32(0), jnp.max(count), flip, tuple(words))
 
 
 def ego_areas(

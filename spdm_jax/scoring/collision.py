@@ -39,7 +39,7 @@ class Contacts(NamedTuple):
     ttc: jax.Array
 
 
-def _object_boxes(forecast: AgentForecast, num_steps: int) -> tuple[Box, jax.Array]:
+def object_boxes(forecast: AgentForecast, num_steps: int) -> tuple[Box, jax.Array]:
     """Boxes `[A, F, T]` at time t + LOOK_AHEAD[f], and whether each can be met at all.
 
     Occupancy maps exist every 0.2 s; a query for step k uses map k // 2.
@@ -79,7 +79,7 @@ def first_contacts(
     reach = [DT * f * speed for f in LOOK_AHEAD]
     shift_x = jnp.stack([box.x + r * box.cos for r in reach])  # [F, T, P]
     shift_y = jnp.stack([box.y + r * box.sin for r in reach])
-    objects, alive = _object_boxes(forecast, steps)
+    objects, alive = object_boxes(forecast, steps)
     near = alive & _near_any(shift_x, shift_y, box, objects)  # [A, F, T]
     num_objects = near.shape[0]
     never = jnp.int32(steps * _NUM_AHEAD)
@@ -155,7 +155,7 @@ def _near_any(shift_x: jax.Array, shift_y: jax.Array, box: Box, objects: Box) ->
     )
 
 
-def _cos_to_object(ego_x, ego_y, ego_heading, x, y) -> jax.Array:
+def cos_to_object(ego_x, ego_y, ego_heading, x, y) -> jax.Array:
     """Cosine of the angle between the ego's heading and the direction to a point."""
     dx, dy = x - ego_x, y - ego_y
     norm = jnp.sqrt(dx * dx + dy * dy)
@@ -163,7 +163,8 @@ def _cos_to_object(ego_x, ego_y, ego_heading, x, y) -> jax.Array:
     return jnp.cos(ego_heading) * (dx / norm) + jnp.sin(ego_heading) * (dy / norm)
 
 
-def _is_ahead(cos: jax.Array, params: ScoringParams) -> jax.Array:
+def is_ahead(cos: jax.Array, params: ScoringParams) -> jax.Array:
+    """Whether a point at this cosine (see `cos_to_object`) lies ahead of the ego."""
     ahead = cos > jnp.cos(params.ahead_angle)
     if cos.dtype == jnp.float64:
         # nuPlan takes arccos without clipping: rounding above 1 gives NaN, which is not ahead.
@@ -171,7 +172,8 @@ def _is_ahead(cos: jax.Array, params: ScoringParams) -> jax.Array:
     return ahead
 
 
-def _is_behind(cos: jax.Array, params: ScoringParams) -> jax.Array:
+def is_behind(cos: jax.Array, params: ScoringParams) -> jax.Array:
+    """Whether a point at this cosine (see `cos_to_object`) lies behind the ego."""
     behind = cos < jnp.cos(params.behind_angle)
     if cos.dtype == jnp.float64:
         behind &= cos >= -1
@@ -274,7 +276,7 @@ def collision_kind(
         jnp.zeros((), x.dtype),
         jnp.asarray(0.5 * vehicle.width, x.dtype),
     )
-    behind = _is_behind(_cos_to_object(x, y, heading, other.x, other.y), params)
+    behind = is_behind(cos_to_object(x, y, heading, other.x, other.y), params)
     stopped_track = ~forecast.is_agent[item] | (forecast.speed[item] <= params.stopped_speed)
     kind = jnp.where(
         boxes_overlap(bumper, other), CollisionKind.ACTIVE_FRONT, CollisionKind.ACTIVE_LATERAL
@@ -368,8 +370,8 @@ def time_to_collision(
         sample = (time + jnp.asarray(LOOK_AHEAD, jnp.int32)[key % _NUM_AHEAD]) // 2
         at = lambda values: values[proposal, time]
         x, y = forecast.x[item, sample], forecast.y[item, sample]
-        cos = _cos_to_object(at(ego.x), at(ego.y), at(ego.heading), x, y)
-        violation = _is_ahead(cos, params) | (at(exposed) & ~_is_behind(cos, params))
+        cos = cos_to_object(at(ego.x), at(ego.y), at(ego.heading), x, y)
+        violation = is_ahead(cos, params) | (at(exposed) & ~is_behind(cos, params))
         return time, violation, jnp.where(violation, 0.0, 1.0).astype(jnp.float32)
 
     time, item, score = _judge(contacts.ttc < never, violates, steps)

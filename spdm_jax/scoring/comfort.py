@@ -1,12 +1,13 @@
 """Comfort: Savitzky-Golay filters as constant matrices, six strict bounds."""
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spdm_jax.config import DT, ScoringParams
+from spdm_jax.config import DT, Scalar, ScoringParams
 from spdm_jax.geometry import unwrap_masked
 from spdm_jax.types import EgoState
 
@@ -47,8 +48,13 @@ def savgol_matrix(size: int, window: int, order: int, derivative: int) -> np.nda
 
 
 def _apply(matrix: np.ndarray, signal: jax.Array) -> jax.Array:
+    return _rounded(filtered(matrix, signal))
+
+
+def filtered(matrix: np.ndarray, signal: jax.Array) -> jax.Array:
+    """Applies a `[T, T]` filter to signals `[..., T]`."""
     operator = jnp.asarray(matrix, signal.dtype)
-    return _rounded(jnp.matmul(signal, operator.T, precision=jax.lax.Precision.HIGHEST))
+    return jnp.matmul(signal, operator.T, precision=jax.lax.Precision.HIGHEST)
 
 
 def _rounded(signal: jax.Array) -> jax.Array:
@@ -62,26 +68,40 @@ def comfort_signals(ego: EgoState) -> dict[str, jax.Array]:
     Source: tuplan_garage `pdm_comfort_metrics`. Its yaw filters keep a window of 5 (the long window
     is not passed on), its acceleration filters take the whole horizon.
     """
+    return comfort_filters(ego, jnp.hypot(ego.ax, ego.ay), _apply)
+
+
+def comfort_filters(
+    ego: EgoState,
+    magnitude: jax.Array,
+    apply: Callable[[np.ndarray, jax.Array], jax.Array],
+) -> dict[str, jax.Array]:
+    """`comfort_signals` with the steps that have no gradient left to the caller.
+
+    Args:
+      ego: `[P, T]` states.
+      magnitude: `[P, T]` norm of the acceleration, m/s^2.
+      apply: how a `[T, T]` matrix filters a signal `[P, T]`.
+    """
     size = ego.ax.shape[-1]
-    magnitude = jnp.hypot(ego.ax, ego.ay)
     smooth = savgol_matrix(size, 8, 2, 0)
     jerk = savgol_matrix(size, size, 2, 1)
     heading = unwrap_masked(ego.heading, jnp.ones(ego.heading.shape, bool))
     # Yaw derivatives do not see a constant; without it float32 keeps its digits.
     heading = heading - heading[..., :1]
     return {
-        "lon_accel": _apply(savgol_matrix(size, size, 2, 0), ego.ax),
-        "lat_accel": _apply(savgol_matrix(size, size, 2, 0), ego.ay),
-        "jerk": _apply(jerk, _apply(smooth, magnitude)),
-        "lon_jerk": _apply(jerk, _apply(smooth, ego.ax)),
-        "yaw_accel": _apply(savgol_matrix(size, 5, 3, 2), heading),
-        "yaw_rate": _apply(savgol_matrix(size, 5, 2, 1), heading),
+        "lon_accel": apply(savgol_matrix(size, size, 2, 0), ego.ax),
+        "lat_accel": apply(savgol_matrix(size, size, 2, 0), ego.ay),
+        "jerk": apply(jerk, apply(smooth, magnitude)),
+        "lon_jerk": apply(jerk, apply(smooth, ego.ax)),
+        "yaw_accel": apply(savgol_matrix(size, 5, 3, 2), heading),
+        "yaw_rate": apply(savgol_matrix(size, 5, 2, 1), heading),
     }
 
 
-def comfort_flags(ego: EgoState, params: ScoringParams) -> jax.Array:
-    """Whether each of the six signals stays strictly inside its bounds, `[P, 6]` bool."""
-    bounds = {
+def comfort_bounds(params: ScoringParams) -> dict[str, tuple[Scalar, Scalar]]:
+    """Lower and upper bound of each of the six signals, in their order."""
+    return {
         "lon_accel": (params.lon_accel_min, params.lon_accel_max),
         "lat_accel": (-params.lat_accel_max, params.lat_accel_max),
         "jerk": (-params.jerk_max, params.jerk_max),
@@ -89,6 +109,11 @@ def comfort_flags(ego: EgoState, params: ScoringParams) -> jax.Array:
         "yaw_accel": (-params.yaw_accel_max, params.yaw_accel_max),
         "yaw_rate": (-params.yaw_rate_max, params.yaw_rate_max),
     }
+
+
+def comfort_flags(ego: EgoState, params: ScoringParams) -> jax.Array:
+    """Whether each of the six signals stays strictly inside its bounds, `[P, 6]` bool."""
+    bounds = comfort_bounds(params)
     signals = comfort_signals(ego)
     return jnp.stack(
         [

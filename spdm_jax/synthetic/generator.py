@@ -4,6 +4,7 @@ import functools
 import inspect
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import shapely
@@ -65,6 +66,17 @@ def make_scene(name: str, seed: int = 0, **options: object) -> RawScenario:
     for option in options:
         if option not in known:
             raise ValueError(f"scene {name!r} has no option {option!r}; it has {', '.join(known)}")
+    return play(name, seed, partial(SCENES[name], **options))
+
+
+def play(name: str, seed: int, scene: Callable[[np.random.Generator], Stage]) -> RawScenario:
+    """Plays a stage and puts it down somewhere; equal arguments give equal bytes.
+
+    Args:
+      name: becomes the scenario's type and, with the seed, its token.
+      seed: of `scene`, of the drivers, and of the place and direction of the whole scene.
+      scene: makes the stage.
+    """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     return play(
         functools.partial(SCENES[name], **options), rng, token=f"{name}-{seed}", scenario_type=name

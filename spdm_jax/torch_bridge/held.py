@@ -5,14 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from spdm_jax.api import fit_config
-from spdm_jax.batching import Precision, leaf_type, place_leaf, x64
+from spdm_jax.batching import Precision, cast_leaf, leaf_type, x64
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.programs import Program
 from spdm_jax.results import ScenarioSet
@@ -135,9 +134,13 @@ class Held:
 
     def _place(self, made: Program, pick: Any) -> Scenario:
         leaves, tree = jax.tree.flatten(self._batch)
-        place = partial(place_leaf, dtype=self.dtype, device=self.device)
-        placed = [place(pick(v), u) for v, u in zip(leaves, made.used, strict=False)]
-        return jax.tree.unflatten(tree, placed)
+        used = made.used[: len(leaves)]
+        cast = [cast_leaf(pick(v), u, self.dtype) for v, u in zip(leaves, used, strict=True)]
+        read = [v for v, u in zip(cast, used, strict=True) if u]
+        placed = iter(jax.device_put(read, self.device))
+        # What nobody reads stays on the host.
+        leaves = [next(placed) if u else v for v, u in zip(cast, used, strict=True)]
+        return jax.tree.unflatten(tree, leaves)
 
 
 class _Cache(dict[Any, Held]):

@@ -46,7 +46,7 @@ PADDING = PaddingConfig(
     roadblocks=(16,),
     grid_cells=(262144,),
     grid_rows=(8192,),
-    grid_slots=(32,),
+    grid_edges=(65536,),
     tracks=(16,),
     time=(128,),
 )

@@ -73,10 +73,10 @@ def stop_at(moment: str, count: int) -> None:
         if path.suffix == ".parquet" and moment == "part without progress":
             hold()
 
-    def loading(chunk: Any, job: Any) -> Any:
+    def loading(*given: Any) -> Any:
         if moment == "load":
             hold()
-        return load(chunk, job)
+        return load(*given)
 
     def processing(self: Any, loaded: Any) -> Any:
         if moment == "compute":

@@ -263,7 +263,7 @@ REFUSED = {
         "field time is not a plain array",
     ),
     "short array": (_shorten, "field time is not a plain array"),
-    "long array": (_lengthen, "field time has bytes after the array's end"),
+    "long array": (_lengthen, "field time is not a plain array .* bytes after"),
     "ids": (_info("lane_ids", ["a"]), r"info.lane_ids has 1 entries for \d+ lanes"),
     "id type": (_info("lane_ids", [1]), r"info.lane_ids is \[1\]"),
     "token type": (_info("token", 5), "info.token is 5"),

@@ -27,10 +27,10 @@ from spdm_jax.proposals.lanes import parallel_path
 from spdm_jax.scoring.aggregate import aggregate
 from spdm_jax.scoring.areas import containing_polygons
 from spdm_jax.scoring.collision import (
-    _cos_to_object,
-    _is_ahead,
-    _is_behind,
     collision_kind,
+    cos_to_object,
+    is_ahead,
+    is_behind,
 )
 from spdm_jax.scoring.comfort import comfort_flags, comfort_signals
 from spdm_jax.scoring.driving import driving_direction
@@ -286,7 +286,7 @@ def _geometry(name, d, report, dtype, tol):
     report.equal(
         name, "front_edge_hits", boxes_overlap(bumper, boxes), d["front_edge_hits"], robust
     )
-    cos = _cos_to_object(ego.x, ego.y, ego.heading, ox, oy)
+    cos = cos_to_object(ego.x, ego.y, ego.heading, ox, oy)
     angle = np.arccos(np.clip(np.asarray(cos, float), -1, 1))
     report.close(
         name,
@@ -297,8 +297,8 @@ def _geometry(name, d, report, dtype, tol):
         np.abs(np.sin(np.asarray(d["relative_angle"]))) > 1e-2,
     )
     for key, ours, limit in (
-        ("ahead", _is_ahead(cos, params.scoring), 30),
-        ("behind", _is_behind(cos, params.scoring), 150),
+        ("ahead", is_ahead(cos, params.scoring), 30),
+        ("behind", is_behind(cos, params.scoring), 150),
     ):
         far = np.abs(np.degrees(np.asarray(d["relative_angle"])) - limit) > (1e-3 if f32 else 1e-9)
         report.equal(name, key, ours, d[key], far)

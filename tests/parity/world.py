@@ -62,8 +62,8 @@ def state_array(state: EgoState, origin: np.ndarray) -> np.ndarray:
 def padded_grid(polygons, dtype) -> PolygonGrid:
     """Grid with power-of-two sizes, so that many scenes share one compiled program."""
     grid = build_grid(polygons)
-    rows = power_bucket(grid.edges.shape[0], 2048)
-    slots = power_bucket(grid.edges.shape[1], 32)
+    rows = power_bucket(grid.edge_start.shape[0], 2048)
+    edges = power_bucket(grid.edges.shape[0], 16384)
     cells = power_bucket(grid.cell_mask.shape[0], 32768)
     masks = power_bucket(grid.masks.shape[0], 512)
     words = power_bucket(grid.masks.shape[1], 4)
@@ -74,8 +74,10 @@ def padded_grid(polygons, dtype) -> PolygonGrid:
         cell_mask=jnp.asarray(pad(grid.cell_mask, cells)),
         cell_edges=jnp.asarray(pad(grid.cell_edges, cells)),
         masks=jnp.asarray(pad(pad(grid.masks, masks), words, 1)),
-        edges=jnp.asarray(pad(pad(grid.edges, rows), slots, 1), dtype),
-        edge_polygon=jnp.asarray(pad(pad(grid.edge_polygon, rows, fill=-1), slots, 1, -1)),
+        edge_start=jnp.asarray(pad(grid.edge_start, rows)),
+        edge_count=jnp.asarray(pad(grid.edge_count, rows)),
+        edges=jnp.asarray(pad(grid.edges, edges), dtype),
+        edge_polygon=jnp.asarray(pad(grid.edge_polygon, edges, fill=-1)),
     )
 
 
