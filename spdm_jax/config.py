@@ -16,7 +16,7 @@ Scalar: TypeAlias = Any
 """A float, or an array where the field says so; traced inside `jit`."""
 
 Tracker = Literal["reference", "corrected"]
-ForecastMode = Literal["constant_velocity", "perfect", "none"]
+ForecastMode = Literal["constant_velocity", "perfect", "reactive", "none"]
 ProgressReference = Literal["auto", "centerline", "goal"]
 
 DT = 0.1
@@ -155,7 +155,8 @@ class PlannerConfig:
       num_route_paths: K, paths of stage 2; 0 is PDM-Closed.
       tracker: "reference" runs what the published code runs, "corrected" repairs the difference
         matrix of the velocity fit.
-      forecast: where the agents' future comes from.
+      forecast: where the agents' future comes from. "reactive" asks a simulation whose traffic
+        reacts how it would beside each proposal; anywhere else it is "perfect".
       progress_reference: "auto" is the centreline for K = 0 and the goal path otherwise.
       max_vehicles: nearest vehicles kept per step; likewise the three fields that follow.
       max_pedestrians: see above.
@@ -183,7 +184,7 @@ class PlannerConfig:
             raise ValueError(f"num_route_paths is {self.num_route_paths}; it must be >= 0")
         for name, value, allowed in (
             ("tracker", self.tracker, ("reference", "corrected")),
-            ("forecast", self.forecast, ("constant_velocity", "perfect", "none")),
+            ("forecast", self.forecast, ("constant_velocity", "perfect", "reactive", "none")),
             ("progress_reference", self.progress_reference, ("auto", "centerline", "goal")),
         ):
             if value not in allowed:

@@ -3,6 +3,7 @@
 Nothing here looks at lanes or keeps memory; that is `spdm_jax.planner`'s part.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -245,6 +246,7 @@ def decide(
     progress_path: Path,
     params: PlannerParams,
     config: PlannerConfig,
+    reacting: Callable[[EgoState], AgentForecast] | None = None,
 ) -> Decision:
     """Proposes, tracks, scores and chooses on given paths.
 
@@ -259,6 +261,8 @@ def decide(
       progress_path: where progress is measured.
       params: traced settings, cast to the dtype of the ego.
       config: static settings.
+      reacting: how the objects of `seen` would move beside each tracked proposal `[P, T]`; scores
+        alone ask for it.
     """
     vehicle = params.vehicle
     with jax.named_scope("propose"):
@@ -271,7 +275,8 @@ def decide(
         reference = (proposals.x, proposals.y, proposals.heading)
         tracked, _ = track(*reference, ego, vehicle, params.tracker, config.tracker)
     with jax.named_scope("score"):
-        world = World(grid, masks, seen.forecast, progress_path)
+        forecast = seen.forecast if reacting is None else reacting(tracked)
+        world = World(grid, masks, forecast, progress_path)
         scores = score_trajectories(tracked, proposals.valid, world, vehicle, params.scoring)
     with jax.named_scope("choose"):
         best = jnp.argmax(scores.total).astype(jnp.int32)

@@ -8,9 +8,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from spdm_jax.agents.forecast import ForecastPoses, constant_velocity, perfect, supplied
+from spdm_jax.agents.forecast import (
+    ForecastPoses,
+    React,
+    constant_velocity,
+    perfect,
+    steady_ego,
+    supplied,
+)
 from spdm_jax.agents.observation import Observation, red_lights, select_objects
-from spdm_jax.config import PlannerConfig, PlannerParams
+from spdm_jax.config import NUM_TRAJECTORY_STATES, PlannerConfig, PlannerParams
 from spdm_jax.decision import Seen, cast_params, decide, notice, progress_of, target_speeds
 from spdm_jax.geometry import Path, ego_box, point_segment_sq
 from spdm_jax.proposals.lanes import (
@@ -162,14 +169,21 @@ def see(
     state: PlannerState,
     params: PlannerParams,
     config: PlannerConfig,
+    react: React | None = None,
 ) -> Seen:
-    """Selects objects, forecasts them and collects the red lights of the route."""
+    """Selects objects, forecasts them and collects the red lights of the route.
+
+    Where traffic reacts, this forecast is the one beside an ego that goes straight on.
+    """
     ego = ego_box(given.ego, params.vehicle)
     observation = given.observation
     selected = select_objects(observation, ego.x, ego.y, state.collided, params.map_radius, config)
     if given.forecast is not None:
         poses = supplied(given.forecast, selected)
-    elif config.forecast == "perfect":
+    elif react is not None:
+        beside = react(steady_ego(given.ego, NUM_TRAJECTORY_STATES))
+        poses = supplied(jax.tree.map(lambda v: v[0], beside), selected)
+    elif config.forecast in ("perfect", "reactive"):
         poses = perfect(observation, selected, scene.tracks)
     else:
         poses = constant_velocity(observation, selected)
@@ -242,6 +256,7 @@ def step(
     state: PlannerState,
     params: PlannerParams,
     config: PlannerConfig,
+    react: React | None = None,
 ) -> tuple[PlanResult, PlannerState]:
     """Plans once: see, prepare paths, propose, track, score, choose, brake if needed.
 
@@ -251,6 +266,7 @@ def step(
       state: what `init` or the previous step left.
       params: traced settings.
       config: static settings.
+      react: how traffic would react; used where the forecast is "reactive".
 
     Returns:
       The plan and the state for the next step.
@@ -260,8 +276,9 @@ def step(
     ego = given.ego
     params = cast_params(params, ego.x.dtype)
     box = ego_box(ego, params.vehicle)
+    react = react if config.forecast == "reactive" and given.forecast is None else None
     with jax.named_scope("see"):
-        seen = see(scene, given, state, params, config)
+        seen = see(scene, given, state, params, config, react)
         lanes, parks = drivable_lanes(scene.map, box.x, box.y, params.map_radius)
         lane = starting_lane(scene.map, scene.route, lanes, ego, params.vehicle)
         masks = area_masks(scene.map, scene.route.lane_on_route, lanes, parks)
@@ -287,6 +304,15 @@ def step(
     by_goal = config.progress_reference == "goal" or (
         config.progress_reference == "auto" and config.num_route_paths > 0
     )
+
+    def reacting(tracked: EgoState) -> AgentForecast:
+        assert react is not None
+        poses = react(tracked)
+        rows = jax.tree.map(lambda v: v[:, seen.forecast.track], poses)
+        return seen.forecast.replace(
+            x=rows.x, y=rows.y, heading=rows.heading, sample_valid=rows.valid
+        )
+
     decision = decide(
         ego,
         state.paths,
@@ -298,6 +324,7 @@ def step(
         state.goal if by_goal else centerline,
         params,
         config,
+        None if react is None else reacting,
     )
     tracked, raw = decision.tracked, decision.scores.progress_raw
     other = progress_of(tracked, centerline if by_goal else state.goal, params.vehicle)

@@ -19,7 +19,19 @@ from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
 from spdm_jax.synthetic import SyntheticReader
 
-VERBS = ("demo", "doctor", "label", "pack", "plan", "report", "score", "show", "sweep", "vocab")
+VERBS = (
+    "demo",
+    "doctor",
+    "label",
+    "pack",
+    "plan",
+    "report",
+    "score",
+    "show",
+    "simulate",
+    "sweep",
+    "vocab",
+)
 
 
 class BrokenReader:

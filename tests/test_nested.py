@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spdm_experiments import cli
-from spdm_experiments.sweep_work import Engine
+from spdm_experiments.sweep_work import SweepEngine
 from spdm_jax import PlannerConfig, PlannerParams, load, pdm_closed, plan, spdm
 from spdm_jax.decision import cast_params
 from spdm_jax.io.build import build_scenario
@@ -190,13 +190,13 @@ def test_sweep_reads_every_number_as_separate_runs_would(
     pack: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     text, speeds = SPEEDS
-    call, seen = Engine._call, []
+    call, seen = SweepEngine._call, []
 
     def spy(self: Any, config: PlannerConfig, *given: Any) -> Any:
         seen.append((config.num_route_paths, len(given[-2].num_history)))
         return call(self, config, *given)
 
-    monkeypatch.setattr(Engine, "_call", spy)
+    monkeypatch.setattr(SweepEngine, "_call", spy)
     out = tmp_path / "run"
     command = ["sweep", str(pack), "--out", str(out), "--planner", "spdm", "--speeds", text]
     counts = (2, 4, 8)

@@ -18,9 +18,11 @@ from spdm_experiments import report_grid as grid
 from spdm_experiments.report_data import Run, load_run
 from spdm_experiments.report_page import page_data, stage_table
 from spdm_experiments.report_scenes import make_players, planner_of, shown_points
+from spdm_experiments.report_terms import TERMS, terms_of
 from spdm_jax import pdm_closed, plan, spdm
 
 GRID = made_up.GRID
+SWEEP = terms_of({"command": "sweep"})
 TOKENS = [f"{kind}-{i}" for i in range(15) for kind in ("curve", "jaywalker")]
 
 
@@ -182,17 +184,17 @@ def test_lines_run_along_what_varies():
 
 
 def test_reason_names_the_first_rule_that_is_broken():
-    good = {name: 1.0 for name in numbers.TERMS}
+    good = {name: 1.0 for name in TERMS}
     row = {**good, "progress_raw": 12.0, "collision_agent": "car-7", "collision_time": 2.3}
     row |= {"ttc_agent": None, "ttc_time": np.inf}
-    assert numbers.first_lost(row) == ("", "")
+    assert SWEEP.first_lost(row) == ("", "")
     row |= {"progress": 0.4}
-    assert numbers.first_lost(row) == ("progress", "12.0 m, 40 % of the best admissible proposal")
+    assert SWEEP.first_lost(row) == ("progress", "12.0 m, 40 % of the best admissible proposal")
     row |= {"time_to_collision": 0.0}
-    assert numbers.first_lost(row) == ("time_to_collision", "less than 1 s to a collision")
+    assert SWEEP.first_lost(row) == ("time_to_collision", "less than 1 s to a collision")
     row |= {"no_at_fault_collision": 0.0, "drivable_area": 0.0}
     told = ("no_at_fault_collision", "at-fault collision with car-7 at 2.3 s")
-    assert numbers.first_lost(row) == told
+    assert SWEEP.first_lost(row) == told
 
 
 def test_worst_scenes_come_first(run: Run):
@@ -266,7 +268,7 @@ def test_missing_pack_gives_a_note(
 def test_unfinished_run_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = made_up.write_run(tmp_path / "run", made_up.scored_rows(GRID, ["a"]), num_scenarios=4)
     assert report(folder, "--out", tmp_path / "page.html", "--players", 0) == 0
-    assert "3 missing (the sweep is not finished)" in capsys.readouterr().out
+    assert "3 missing (the run is not finished)" in capsys.readouterr().out
 
 
 def damage(folder: Path, how: str) -> None:
@@ -298,11 +300,11 @@ def damage(folder: Path, how: str) -> None:
 @pytest.mark.parametrize(
     "how, text",
     [
-        ("no folder", "run: no such folder; name one that spdm sweep has written"),
+        ("no folder", "run: no such folder; name one that spdm sweep or spdm simulate has written"),
         ("no run.json", "run: no run.json, so no run folder"),
         ("not JSON", "run.json: not valid JSON"),
-        ("another verb", "run.json: written by spdm plan; spdm report reads what spdm sweep"),
-        ("no verb", "run.json: does not say that spdm sweep wrote it"),
+        ("another verb", "run.json: written by spdm plan; spdm report reads what spdm sweep or"),
+        ("no verb", "run.json: does not say that spdm sweep or spdm simulate wrote it"),
         ("newer", "run.json: format is 2, this version reads 1"),
         ("no rows", "run: no rows/part-*.parquet yet"),
         ("damaged rows", "parquet: damaged ("),
@@ -344,7 +346,7 @@ def test_figures_draw_the_summaries(run: Run):
         assert x.tolist() == [GRID[i]["num_proposals"] for i in points]
         assert y.tolist() == pytest.approx([summaries[i].means["total"] for i in points])
     panels = figures.plot_subscores(found[:2]).axes
-    assert [panel.get_title() for panel in panels] == list(numbers.TERMS.values())[1:]
+    assert [panel.get_title() for panel in panels] == list(TERMS.values())[1:]
     per_scenario = figures.plot_runtime([run], found[:2]).axes[0]
     assert per_scenario.get_lines()[0].get_ydata() == pytest.approx([4.6, 7.0])
 

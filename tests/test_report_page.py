@@ -12,8 +12,9 @@ import pytest
 import browser
 import made_up_run as made_up
 from browser import Page
-from spdm_experiments.report_data import TERMS, Run, load_run, summarise
+from spdm_experiments.report_data import Run, load_run, summarise
 from spdm_experiments.report_page import MAX_DOTS, Players, page_data, render
+from spdm_experiments.report_terms import TERMS
 
 GRID = made_up.GRID
 TOKENS = [f"{kind}-{i}" for i in range(12) for kind in ("curve", "jaywalker")]

@@ -16,9 +16,9 @@ from polars.testing import assert_frame_equal
 
 import sweep_child as child
 import sweep_pack as packs
-from spdm_experiments import cli, run_folder, sweep_stages, sweep_work
+from spdm_experiments import cli, run_folder, sweep_stages, sweep_work, work
 from spdm_experiments.inventory import Shard, take_inventory
-from spdm_experiments.sweep_work import Engine
+from spdm_experiments.sweep_work import SweepEngine
 from spdm_experiments.terminal import RateLine
 from spdm_jax.io.scenario_file import read_scenario
 
@@ -138,7 +138,7 @@ def test_finished_run_says_so_and_computes_nothing(
     out = tmp_path / "run"
     assert run(pack, out) == 0
     before = {path: path.stat().st_mtime_ns for path in (out / "rows").iterdir()}
-    monkeypatch.setattr(Engine, "process", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(SweepEngine, "process", lambda *_: pytest.fail("computed again"))
     assert run(pack, out, "--chunk", "2") == 0
     assert f"all {COUNT} scenarios were done already, 0 failed" in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in (out / "rows").iterdir()}
@@ -277,7 +277,7 @@ def test_failures_are_rows_with_reasons(
     shutil.copytree(pack, copy)
     packs.write_pack(copy, 1, slow=1)  # the cheap function lets it overflow
     (copy / "scene-01.npz").write_bytes(b"PK no archive")
-    call = Engine._call
+    call = SweepEngine._call
 
     def not_finite(self: Any, *given: Any) -> Any:
         reading, run_ms = call(self, *given)
@@ -285,14 +285,14 @@ def test_failures_are_rows_with_reasons(
         finite[2, 0] = False
         return reading.replace(finite=finite), run_ms
 
-    load_chunk = sweep_work.load_chunk
+    load_chunk = work.load_chunk
 
     def loading(*given: Any) -> Any:
         (copy / "scene-05.npz").write_bytes(b"gone meanwhile")
         return load_chunk(*given)
 
-    monkeypatch.setattr(Engine, "_call", not_finite)
-    monkeypatch.setattr("spdm_experiments.sweep.load_chunk", loading)
+    monkeypatch.setattr(SweepEngine, "_call", not_finite)
+    monkeypatch.setattr("spdm_experiments.grid_run.load_chunk", loading)
     assert run(copy, out, "--num-proposals", "20", "30") == 1
     table = rows(out)
     assert table.height == 2 * COUNT

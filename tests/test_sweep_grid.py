@@ -9,7 +9,7 @@ import tyro
 
 from spdm_experiments.options import Sweep
 from spdm_experiments.sweep_grid import make_points, runs_of
-from spdm_experiments.sweep_rows import Layout
+from spdm_experiments.sweep_rows import layout_of
 
 
 def grid(*arguments: str, file: str | None = None, tmp_path: Path | None = None) -> list[dict]:
@@ -44,8 +44,8 @@ def test_flags_make_the_product():
     assert {p["idm.headway_time"] for p in points} == {1.0, 1.5}
     assert {p["scoring.ttc_weight"] for p in points} == {7.0}
     assert {p["forecast"] for p in points} == {"none"}
-    assert Layout.of(points).names == ["merge_times", "horizon", "idm.headway_time"]
-    assert Layout.of(points).point(0)["merge_times"] == "4,2,6"
+    assert layout_of(points).names == ["merge_times", "horizon", "idm.headway_time"]
+    assert layout_of(points).point(0)["merge_times"] == "4,2,6"
 
 
 def test_values_reach_the_planner(tmp_path: Path):

@@ -22,6 +22,7 @@ from spdm_experiments.options import (
     Report,
     Score,
     Show,
+    Simulate,
     Sweep,
     Vocab,
 )
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         resumes = isinstance(options, Pack) and not options.overwrite
         hint = "; the same command goes on where it stopped" if resumes else ""
-        if isinstance(options, Label | Sweep):
+        if isinstance(options, Label | Simulate | Sweep):
             hint = f"; go on with: spdm {shlex.join(sys.argv[1:] if argv is None else argv)}"
         print(f"spdm: interrupted{hint}", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -82,6 +83,8 @@ def run(options: Options) -> bool:
             return commands.score(options)
         case Show():
             return commands.show(options)
+        case Simulate():
+            return commands.simulate(options)
         case Sweep():
             return commands.sweep(options)
         case Vocab():

@@ -17,6 +17,7 @@ from spdm_experiments.options import (
     Report,
     Score,
     Show,
+    Simulate,
     Sweep,
     Vocab,
 )
@@ -114,6 +115,13 @@ def sweep(options: Sweep) -> bool:
     from spdm_experiments.sweep import run_sweep
 
     return run_sweep(options)
+
+
+def simulate(options: Simulate) -> bool:
+    """Drives scenarios in simulation; False if a scenario failed."""
+    from spdm_experiments.simulate import run_simulate
+
+    return run_simulate(options)
 
 
 def report(options: Report) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import io
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -18,7 +18,7 @@ import numpy as np
 
 from spdm_experiments import report_data as numbers
 from spdm_experiments import report_grid as grid
-from spdm_experiments.report_data import TERMS, PointSummary, Run
+from spdm_experiments.report_data import PointSummary, Run
 from spdm_experiments.report_page import (
     LINE_COLORS,
     STAGES,
@@ -26,6 +26,7 @@ from spdm_experiments.report_page import (
     run_names,
     stage_table,
 )
+from spdm_experiments.report_terms import TERMS
 from spdm_jax.io.scenario_file import write_atomically
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def write_figures(runs: Sequence[Run], folder: Path, *, seed: int = 0) -> list[P
         figures = {
             f"score_over_{short}": plot_score(found, axis),
             f"runtime_over_{'np' if timed else short}": plot_runtime(runs, found, axis),
-            "subscores": plot_subscores(found, axis),
+            "subscores": plot_subscores(found, axis, numbers.common_terms(runs).titles),
         }
         for name, figure in figures.items():
             _footer(figure, runs)
@@ -178,14 +179,29 @@ def plot_score(found: Sequence[Curve], axis: str = "num_proposals") -> Figure:
 
 
 @_styled
-def plot_subscores(found: Sequence[Curve], axis: str = "num_proposals") -> Figure:
-    """Draws each sub-score in a panel of its own; see `plot_score`."""
-    figure = _figure(2.1 * _COLUMN, 3.7)
-    panels = figure.subplots(2, 3, sharex=True)
-    for panel, term in zip(panels.flat, [term for term in TERMS if term != "total"], strict=True):
+def plot_subscores(
+    found: Sequence[Curve],
+    axis: str = "num_proposals",
+    titles: Mapping[str, str] = TERMS,
+) -> Figure:
+    """Draws each sub-score in a panel of its own; see `plot_score`.
+
+    Args:
+      found: from `curves`.
+      axis: the parameter below.
+      titles: scores of the run, see `Run.terms`; the first, their sum, has no panel.
+    """
+    _, *terms = titles
+    columns = 3 if len(terms) <= 6 else 4
+    rows = -(-len(terms) // columns)
+    figure = _figure(2.1 * _COLUMN, 1.85 * rows)
+    panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    for panel, term in zip(panels.flat, terms, strict=False):
         _draw_curves(panel, found, term)
-        panel.set_title(TERMS[term], pad=3)
-    panels[1, 1].set_xlabel(_math(axis_title(axis)))
+        panel.set_title(titles[term], pad=3)
+    for panel in panels.flat[len(terms) :]:
+        panel.set_visible(False)
+    panels[-1, 1].set_xlabel(_math(axis_title(axis)))
     _legend(figure, panels.flat[0], len(found), outside=True)
     return figure
 

@@ -27,6 +27,7 @@ from spdm_jax.padding import AXES, PATH_ROOM, PaddingConfig
 from spdm_jax.schema import LEAVES
 
 _COUNT = "map.lanes.centerline.count"
+_ITERATIONS = "num_iterations"
 _SEQUENCES = ("route.centerline_lanes", "route.goal_lanes", "route.branch_lanes")
 _LEAF_OF = {axis: next(p for p, leaf in LEAVES.items() if axis in leaf.axes) for axis in AXES}
 """A leaf that has the axis."""
@@ -45,6 +46,7 @@ class Entry:
       token, log_name, map_name, scenario_type, source: as in `ScenarioInfo`.
       sizes: length of every free axis.
       route_points: points of the longest lane sequence that a plan may follow.
+      num_iterations: length of the scenario's own window.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class Entry:
     source: str
     sizes: Mapping[str, int]
     route_points: int
+    num_iterations: int
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,9 @@ def _look(path: Path) -> tuple[Entry, bytes]:
                 leaf = _LEAF_OF[axis]
                 shape = array_header(unpack(file, members[f"{leaf}.npy"], _HEADER))[0]
                 sizes |= {a: n for a, n in zip(LEAVES[leaf].axes, shape, strict=True) if a in AXES}
-            count, *sequences = (
-                stored_array(file, members[f"{name}.npy"]) for name in (_COUNT, *_SEQUENCES)
+            count, iterations, *sequences = (
+                stored_array(file, members[f"{name}.npy"])
+                for name in (_COUNT, _ITERATIONS, *_SEQUENCES)
             )
         count = np.append(count, 0)  # the appended entry serves -1
         points = max((int(count[s].sum(axis=1).max()) for s in sequences if len(s)), default=0)
@@ -132,6 +136,7 @@ def _look(path: Path) -> tuple[Entry, bytes]:
             source=str(info["source"]),
             sizes=sizes,
             route_points=points,
+            num_iterations=int(iterations),
         )
     except UNREADABLE as error:
         raise ScenarioError(

@@ -1,15 +1,14 @@
 """`spdm label`: all sub-scores of one vocabulary in many scenes, into a folder to train from."""
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from spdm_experiments.chunks import scenario_files, suite_name
-from spdm_experiments.inventory import Inventory, Shard, split, take_inventory
+from spdm_experiments.inventory import Inventory, Shard, split
 from spdm_experiments.label_folder import (
     FORMAT,
     clean,
@@ -22,39 +21,16 @@ from spdm_experiments.label_scene import COMPONENTS, Switches
 from spdm_experiments.label_work import MEMORY, Chunk, Group, Labeller, index_row
 from spdm_experiments.options import Label
 from spdm_experiments.parts import part_name
-from spdm_experiments.run_folder import Progress, alone, note
-from spdm_experiments.runtime import configure_jax, now, provenance, stop_between_chunks
-from spdm_experiments.terminal import RateLine, print_files, reasons
-from spdm_jax import PlannerConfig
+from spdm_experiments.runtime import configure_jax, now, provenance
+from spdm_experiments.sequence import Verb, go_on, usable_inventory
+from spdm_experiments.work import Done
+from spdm_jax import Failure, PlannerConfig
 from spdm_jax.batching import ShapeGroup, group_by_shape, prefetch
-from spdm_jax.io.raw import ScenarioError
 from spdm_jax.labels import INDEX
 from spdm_jax.padding import PATH_ROOM, bucket
 from spdm_jax.trajectories import check_trajectories, resample
 
 DTYPES = {"f16": np.dtype(np.float16), "f32": np.dtype(np.float32)}
-
-
-@dataclass
-class Tally:
-    """What is done.
-
-    Attributes:
-      done: token -> reason, "" for scenes with labels.
-      scenes: of them, those done by this process.
-      load_s, write_s: seconds of this process.
-    """
-
-    done: dict[str, str]
-    scenes: int = 0
-    load_s: float = 0.0
-    write_s: float = 0.0
-
-    def counts(self, total: int) -> dict[str, Any]:
-        """Returns how far the shard is."""
-        failed = sum(bool(reason) for reason in self.done.values())
-        counts = {"scenarios": total, "done": len(self.done), "failed": failed}
-        return {**counts, "finished": len(self.done) == total}
 
 
 def read_vocabulary(path: Path, dt: float) -> np.ndarray:
@@ -121,166 +97,123 @@ def run_label(options: Label) -> bool:
         DTYPES[options.dtype],
         options.precision,
     )
-    inventory = take_inventory(scenario_files(options.scenes, options.limit))
-    if not inventory.entries:
-        raise ScenarioError(f"{options.scenes}: no usable scenario: {inventory.failures[0].reason}")
+    inventory = usable_inventory(scenario_files(options.scenes, options.limit), options.scenes)
     configure_jax(options)
-    origin = provenance()
-    about = _about(options, labeller, inventory, origin)
-    note(open_folder(options.out, about, labeller.vocabulary))
-    with alone(options.out, shard):
-        clean(options.out, shard)
+    return go_on(LabelRun(options, labeller, inventory), inventory, shard)
+
+
+class LabelRun(Verb):
+    """One folder of labels."""
+
+    def __init__(self, options: Label, labeller: Labeller, inventory: Inventory):
+        """Puts it together."""
+        self.folder, self.rows, self.origin = options.out, options.out / INDEX, provenance()
+        self._options, self._labeller, self._inventory = options, labeller, inventory
+
+    def open(self) -> list[str]:
+        """See `Verb`."""
+        options, labeller, inventory = self._options, self._labeller, self._inventory
+        sources = sorted({entry.source for entry in inventory.entries})
+        about = {
+            "format": FORMAT,
+            "command": "label",
+            "components": list(labeller.components),
+            "dtype": labeller.dtype.name,
+            "vocabulary": {
+                "hash": digest(labeller.vocabulary),
+                "shape": list(labeller.vocabulary.shape),
+            },
+            "vocabulary_file": str(options.vocabulary),
+            "suite": suite_name(options.scenes, sources),
+            "scenes": str(options.scenes),
+            "num_scenarios": len(inventory),
+            "input_hash": inventory.digest,
+            "precision": options.precision,
+            "config": {
+                "tracker": options.tracker,
+                "forecast": options.forecast,
+                "progress_reference": options.progress_reference,
+            },
+            **self.origin,
+            "created": now(),
+        }
+        return open_folder(self.folder, about, labeller.vocabulary)
+
+    def clean(self, shard: Shard) -> None:
+        """See `Verb`."""
+        clean(self.folder, shard)
+
+    def read_done(self) -> tuple[dict[str, str], list[str]]:
+        """See `Verb`."""
+        labeller = self._labeller
         shape = (len(labeller.vocabulary), len(labeller.components))
-        done, notes = read_done(options.out, shape, labeller.dtype)
-        note(notes)
-        tokens = [e.token for e in inventory.entries] + [f.token for f in inventory.failures]
-        mine = {token for token in tokens if shard.holds(token)}
-        tally = Tally({token: reason for token, reason in done.items() if token in mine})
-        missing = mine - tally.done.keys()
-        if missing:
-            _write_unusable(options.out, labeller, inventory, shard, missing, tally)
-            chunks = list(_chunks(options, labeller, inventory, shard, missing))
-            progress = Progress(options.out, shard, origin)
-            _work(options.out, labeller, chunks, tally, progress, len(mine))
-        return _close(options, labeller, tally, len(mine), bool(missing))
+        return read_done(self.folder, shape, labeller.dtype)
 
-
-def _about(
-    options: Label, labeller: Labeller, inventory: Inventory, origin: dict[str, object]
-) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "command": "label",
-        "components": list(labeller.components),
-        "dtype": labeller.dtype.name,
-        "vocabulary": {
-            "hash": digest(labeller.vocabulary),
-            "shape": list(labeller.vocabulary.shape),
-        },
-        "vocabulary_file": str(options.vocabulary),
-        "suite": suite_name(options.scenes, sorted({entry.source for entry in inventory.entries})),
-        "scenes": str(options.scenes),
-        "num_scenarios": len(inventory),
-        "input_hash": inventory.digest,
-        "precision": options.precision,
-        "config": {
-            "tracker": options.tracker,
-            "forecast": options.forecast,
-            "progress_reference": options.progress_reference,
-        },
-        **origin,
-        "created": now(),
-    }
-
-
-def _chunks(
-    options: Label, labeller: Labeller, inventory: Inventory, shard: Shard, missing: set[str]
-) -> Iterator[Chunk]:
-    for number, found in enumerate(group_by_shape([entry.sizes for entry in inventory.entries])):
-        group = _group(options, labeller, inventory, found)
-        entries = [inventory.entries[row] for row in found.rows]
-        entries = [entry for entry in entries if entry.token in missing]
-        for rows in split(len(entries), options.chunk):
-            mine = [entries[i] for i in rows]
-            name = part_name(shard.name, f"g{number}", [entry.token for entry in mine])
-            yield Chunk(name, group, mine)
-
-
-def _group(options: Label, labeller: Labeller, inventory: Inventory, found: ShapeGroup) -> Group:
-    points = max(inventory.entries[row].route_points for row in found.rows)
-    config = PlannerConfig(
-        tracker="reference" if options.tracker == "none" else options.tracker,
-        forecast=options.forecast,
-        progress_reference=options.progress_reference,
-        max_path_points=bucket(points, PATH_ROOM),
-    )
-    piece = max(1, MEMORY // labeller.bytes_per_scene(found.padding))
-    return Group(found.padding, Switches(config, options.tracker != "none"), piece)
-
-
-def _write_unusable(
-    folder: Path,
-    labeller: Labeller,
-    inventory: Inventory,
-    shard: Shard,
-    missing: set[str],
-    tally: Tally,
-) -> None:
-    """Notes files that cannot be read in the index."""
-    failures = [failure for failure in inventory.failures if failure.token in missing]
-    if failures:
-        name = part_name(shard.name, "unusable", [failure.token for failure in failures])
+    def write_unusable(self, name: str, failures: Sequence[Failure]) -> None:
+        """See `Verb`."""
+        labeller = self._labeller
         none = np.zeros((0, len(labeller.vocabulary), len(labeller.components)), labeller.dtype)
-        write_part(folder, name, none, [index_row(f, None, "failed") for f in failures])
-        tally.done |= {failure.token: failure.reason for failure in failures}
+        write_part(self.folder, name, none, [index_row(f, None, "failed") for f in failures])
 
-
-def _work(
-    folder: Path,
-    labeller: Labeller,
-    chunks: Sequence[Chunk],
-    tally: Tally,
-    progress: Progress,
-    total: int,
-) -> None:
-    line = RateLine(total, len(tally.done))
-
-    def save() -> None:
-        seconds = {"load_s": round(tally.load_s, 3), "write_s": round(tally.write_s, 3)}
-        work = {"scenarios": tally.scenes, **seconds, **labeller.counters()}
-        progress.save(tally.counts(total), work)
-
-    with stop_between_chunks() as stopping:
-        line.show(len(tally.done), 0.0, 0, 0.0)
-        save()
-        labels, rows = [], []
-        for piece in prefetch(labeller.load(chunks)):
+    def run(self, shard: Shard, missing: set[str], stop: Callable[[], bool]) -> Iterator[Done]:
+        """See `Verb`. A chunk comes in pieces that fit into memory."""
+        labeller = self._labeller
+        labels: list[np.ndarray] = []
+        rows: list[dict[str, Any]] = []
+        before, load_s = labeller.counters(), 0.0
+        for piece in prefetch(labeller.load(list(self._chunks(shard, missing)))):
             mine, index = labeller.score(piece)
             labels.append(mine)
             rows += index
             piece.scenes.release()
-            tally.load_s += piece.seconds
-            if piece.last:
-                started = time.perf_counter()
-                write_part(folder, piece.chunk.name, np.concatenate(labels), rows)
-                tally.write_s += time.perf_counter() - started
-                tally.scenes += len(rows)
-                tally.done |= {row["token"]: row["reason"] for row in rows}
-                save()
-                counters = labeller.counters()
-                compile_s = counters["compile_s"]
-                line.show(len(tally.done), compile_s, counters["programs"], compile_s)
-                labels, rows = [], []
-                if stopping():
-                    break
-    line.close()
-    note(labeller.counters()["messages"])
+            load_s += piece.seconds
+            if not piece.last:
+                continue
+            started = time.perf_counter()
+            write_part(self.folder, piece.chunk.name, np.concatenate(labels), rows)
+            counters = labeller.counters()
+            spent = lambda name, now=counters, then=before: now[name] - then[name]
+            yield Done(
+                piece.chunk.name,
+                {row["token"]: row["reason"] for row in rows},
+                spent("programs"),
+                {
+                    "load": load_s,
+                    "compile": spent("compile_s"),
+                    "run": spent("run_s"),
+                    "write": time.perf_counter() - started,
+                },
+                counters["messages"][len(before["messages"]) :],
+            )
+            labels, rows, before, load_s = [], [], counters, 0.0
+            if stop():
+                return
 
+    def _chunks(self, shard: Shard, missing: set[str]) -> Iterator[Chunk]:
+        inventory = self._inventory
+        for number, found in enumerate(group_by_shape([e.sizes for e in inventory.entries])):
+            group = self._group(found)
+            entries = [inventory.entries[row] for row in found.rows]
+            entries = [entry for entry in entries if entry.token in missing]
+            for rows in split(len(entries), self._options.chunk):
+                mine = [entries[i] for i in rows]
+                name = part_name(shard.name, f"g{number}", [entry.token for entry in mine])
+                yield Chunk(name, group, mine)
 
-def _close(options: Label, labeller: Labeller, tally: Tally, total: int, worked: bool) -> bool:
-    """Prints the outcome.
-
-    Raises:
-      KeyboardInterrupt: scenarios are missing because the user stopped the run.
-    """
-    counts = tally.counts(total)
-    whose = "" if options.shard == "1/1" else f" of shard {options.shard}"
-    size = len(labeller.vocabulary)
-    what = f"{size} trajectories x {len(labeller.components)} components, {labeller.dtype}"
-    if counts["finished"] and not worked:
-        print(f"all {total} scenarios{whose} were done already, {counts['failed']} failed")
-    else:
-        print(f"{counts['done']} of {total} scenarios{whose} done, {counts['failed']} failed")
-        found = labeller.counters()
-        print(
-            f"load {tally.load_s:.1f} s, compile {found['compile_s']:.1f} s, "
-            f"run {found['run_s']:.1f} s, write {tally.write_s:.1f} s"
+    def _group(self, found: ShapeGroup) -> Group:
+        options, labeller = self._options, self._labeller
+        points = max(self._inventory.entries[row].route_points for row in found.rows)
+        config = PlannerConfig(
+            tracker="reference" if options.tracker == "none" else options.tracker,
+            forecast=options.forecast,
+            progress_reference=options.progress_reference,
+            max_path_points=bucket(points, PATH_ROOM),
         )
-    print(f"per scenario: {what}")
-    failed = {token: reason for token, reason in tally.done.items() if reason}
-    for reason in reasons(failed, options.out / INDEX):
-        print(reason)
-    print_files([options.out])
-    if not counts["finished"]:
-        raise KeyboardInterrupt
-    return not counts["failed"]
+        piece = max(1, MEMORY // labeller.bytes_per_scene(found.padding))
+        return Group(found.padding, Switches(config, options.tracker != "none"), piece)
+
+    def tell(self) -> None:
+        """See `Verb`."""
+        labeller = self._labeller
+        size, components = len(labeller.vocabulary), len(labeller.components)
+        print(f"per scenario: {size} trajectories x {components} components, {labeller.dtype}")

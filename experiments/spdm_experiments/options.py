@@ -11,6 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 Format = Literal["auto", "nuplan", "av2", "synthetic"]
 PlannerName = Literal["spdm", "pdm-closed"]
+SimulatedPlanner = Literal["spdm", "pdm-closed", "idm", "constant-velocity", "log-replay"]
 Forecast = Literal["constant_velocity", "perfect", "none"]
 
 
@@ -92,7 +93,8 @@ class Pack(Common):
 
     source: Annotated[Positional[str], arg(metavar="SRC")]
     """A .db file or a folder of them (nuPlan), a log folder or a folder of logs (Argoverse 2), or
-    a comma-separated list of scene names, "all" for every one (synthetic)."""
+    a comma-separated list of scene names, "all" for every one, or the name of a suite
+    (synthetic)."""
     destination: Annotated[Positional[Path], arg(metavar="DST")]
     """Folder to write, one file per scenario."""
     format: Format = "auto"
@@ -108,7 +110,7 @@ class Pack(Common):
     log: tuple[str, ...] = ()
     """Take these logs only (nuPlan)."""
     seeds: tuple[int, ...] = (0,)
-    """Seeds of each scene (synthetic)."""
+    """Seeds of each scene (synthetic); of a suite the numbers of its scenes, all if left out."""
     stride: float | None = None
     """Seconds between the scenarios of one log (Argoverse 2)."""
     limit: int | None = None
@@ -192,7 +194,27 @@ class Show(Planner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep(Compute):
+class OverGrid(Compute):
+    """Options of every verb that computes many scenarios at every point of a grid."""
+
+    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
+    """A folder of scenario files (see spdm pack), or one file."""
+    out: Path = Path("out/run")
+    """Run folder to write or to go on with."""
+    limit: int | None = None
+    """Take the first so many scenarios, in the order of their file names."""
+    chunk: int | Literal["auto"] = "auto"
+    """Scenarios per part of the run folder; auto goes by memory."""
+    shard: str = "1/1"
+    """I/N: take every scenario that falls into part I of N. Parts need no contact with each other
+    and may share a folder."""
+    cluster: str | None = None
+    """Spread the work with Ray: "local" (or local:4, with four processes), "auto" for the cluster
+    this machine is part of, or an address."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep(OverGrid):
     """Plan every scenario at every point of a grid of settings, write a row for each.
 
     Each option below takes several values; the grid is their product. The same command goes on
@@ -200,8 +222,6 @@ class Sweep(Compute):
     reason; the exit code is then 1.
     """
 
-    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
-    """A folder of scenario files (see spdm pack), or one file."""
     grid: Path | None = None
     """A TOML file with one or several grids; see docs/sweeps.md."""
     planner: tuple[PlannerName, ...] = ()
@@ -227,27 +247,58 @@ class Sweep(Compute):
     """Any other number of the planner: idm.headway_time=1,1.5 scoring.ttc_weight=5."""
     out: Path = Path("out/sweep")
     """Run folder to write or to go on with."""
-    limit: int | None = None
-    """Take the first so many scenarios, in the order of their file names."""
-    chunk: int | Literal["auto"] = "auto"
-    """Scenarios per part of the run folder; auto goes by memory."""
-    shard: str = "1/1"
-    """I/N: take every scenario that falls into part I of N. Parts need no contact with each other
-    and may share a folder."""
     seed: int = 0
     """Picks the scenarios of --stage-times."""
     trajectories: bool = False
     """Also write the chosen proposals' poses, in map coordinates."""
     stage_times: bool = False
     """Also time proposal generation, tracking and scoring for each number of proposals."""
-    cluster: str | None = None
-    """Spread the work with Ray: "local" (or local:4, with four processes), "auto" for the cluster
-    this machine is part of, or an address."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate(OverGrid):
+    """Drive whole scenarios in simulation and score the drives with nuPlan's metrics.
+
+    Several values of an option make a product of runs; each scenario has a row for every one of
+    them. The same command goes on where an interrupted one stopped, also after a kill. A scenario
+    that fails is a row with its reason; the exit code is then 1.
+    """
+
+    scenes: Annotated[Positional[Path], arg(metavar="SUITE|SCENES")]
+    """A built-in suite (common-14, interactive-8), a folder of scenario files (see spdm pack), or
+    one file."""
+    planner: tuple[SimulatedPlanner, ...] = ("spdm",)
+    """Who drives the ego."""
+    num_proposals: tuple[int, ...] = ()
+    """Proposals per step: SPDM 15, 20, 25, ... (60 if left out); PDM-Closed 1, 3, 6, 15, 30 or 60
+    (15 if left out)."""
+    traffic: tuple[Literal["reactive", "replay"], ...] = ()
+    """Vehicles that drive by IDM and react to the ego (if left out), or all objects as
+    recorded."""
+    mode: tuple[Literal["closed", "open"], ...] = ("closed",)
+    """closed: the ego tracks its plans. open: the ego keeps to the record, and its plans are
+    compared with what the recorded driver did next."""
+    forecast: tuple[Forecast, ...] = ()
+    """Where PDM-Closed and SPDM take the other agents' future from."""
+    progress: tuple[Literal["auto", "centerline", "goal"], ...] = ()
+    """What PDM-Closed and SPDM measure progress along; see spdm plan --progress-reference."""
+    replan_every: int = 1
+    """Steps of 0.1 s between two plans."""
+    record: Literal["none", "history", "plans"] = "none"
+    """Also write the drives, or the drives and the plan of every step, for the report's player."""
+    types: tuple[str, ...] = ()
+    """Take scenarios of these types only."""
+    by_type: bool = False
+    """Print the scores of each scenario type as well."""
+    seed: int = 0
+    """Seed of the bootstrap intervals."""
+    out: Path = Path("out/simulate")
+    """Run folder to write or to go on with."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report(OnDevice):
-    """Write one HTML page for a run of spdm sweep, or for two of them side by side.
+    """Write one HTML page for a run of spdm sweep or spdm simulate, or for two side by side.
 
     The page needs no server and no network, and may be moved. It has tables with bootstrap
     intervals, score and runtime over the number of proposals, two grid points scenario by
@@ -255,7 +306,7 @@ class Report(OnDevice):
     """
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """A folder that spdm sweep has written, finished or not."""
+    """A folder that spdm sweep or spdm simulate has written, finished or not."""
     run2: Annotated[Positional[Path | None], arg(metavar="RUN2")] = None
     """Another one; differences are RUN minus RUN2."""
     out: Path = Path("report.html")
@@ -263,9 +314,10 @@ class Report(OnDevice):
     worst: int = 50
     """Scenes in each list of worst scenes."""
     players: int = 12
-    """Scenes in the player, at most; they are planned anew. 0 for none."""
+    """Scenes in the player, at most: planned anew for a sweep, as recorded for a simulation
+    (--record). 0 for none."""
     scenes: Path | None = None
-    """The folder of the scenario files, if it is no longer where the sweep found it."""
+    """The folder of the scenario files, if it is no longer where the run found it."""
     figures: Path | None = None
     """Also write figures for papers (SVG, PDF, PNG) into this folder."""
     seed: int = 0
@@ -339,4 +391,4 @@ class Vocab(Compute):
     """Take the first so many scenarios, in the order of their file names."""
 
 
-Options = Demo | Doctor | Label | Pack | Plan | Report | Score | Show | Sweep | Vocab
+Options = Demo | Doctor | Label | Pack | Plan | Report | Score | Show | Simulate | Sweep | Vocab

@@ -85,8 +85,7 @@ function drawSummary(part) {
     part.append(list, pointTable(data.points.filter((p) => p.run === i)));
   });
   part.append(element("p", "Means over the scenarios with scores; the interval is a bootstrap over scenarios. Failed scenarios are "
-    + `counted and not averaged in. ${data.terms.slice(1).map((t) => `${t.short} ${t.title.toLowerCase()}`).join(", ")}, m the chosen `
-    + "proposal's progress in 4 s, brake the share of scenarios with an emergency brake, ms the run time per scenario without compilation.",
+    + `counted and not averaged in. ${data.terms.slice(1).map((t) => `${t.short} ${t.title.toLowerCase()}`).join(", ")}, ${data.words.summary}`,
   { class: "quiet" }));
   if (two) part.append(element("h2", "Total score, A minus B, scenario by scenario"), pairedTable());
 }
@@ -99,14 +98,14 @@ function pointTable(points) {
     { title: "scenarios" }, { title: "failed" },
     { title: first.short, hint: first.title }, { title: "95 % interval" },
     ...rest.map((t) => ({ title: t.short, hint: t.title })),
-    { title: "m", hint: "progress, m" }, { title: "brake" }, { title: "ms", hint: "per scenario" },
+    { title: "m", hint: "progress, m" }, ...(data.braking ? [{ title: "brake" }] : []), { title: "ms", hint: "per scenario" },
   ];
   return table(columns, points, (p) => [
     ...data.parameters.map((k) => p.parameters[k.key]),
     String(p.scenarios), String(p.failed),
     fixed(p.means[total], 4), between(p.intervals[total], 4), ...rest.map((t) => fixed(p.means[t.key], 3)),
     fixed(p.means[data.metres], 1),
-    p.braking === null ? "–" : `${(100 * p.braking).toFixed(1)} %`, fixed(p.ms, 1),
+    ...(data.braking ? [p.braking === null ? "–" : `${(100 * p.braking).toFixed(1)} %`] : []), fixed(p.ms, 1),
   ], { mark: (line, p) => line.classList.toggle("best", p.means.total === best) });
 }
 
@@ -190,7 +189,7 @@ function drawScore(part) {
     interval: (p, key) => p.intervals[key],
     digits: 4,
     yTitle: titleOf,
-    from: "Mean over scenarios of the chosen proposal; bands and bars are 95 % bootstrap intervals over scenarios. The axis does not start at zero.",
+    from: data.words.score,
   });
 }
 

@@ -1,9 +1,9 @@
-"""`spdm report`: one or two run folders of `spdm sweep` as a page, and as figures for papers."""
+"""`spdm report`: one or two folders of `spdm sweep` or `simulate` as a page and as figures."""
 
 import sys
 
 from spdm_experiments.options import Report
-from spdm_experiments.report_data import Run, failures, load_run
+from spdm_experiments.report_data import Run, common_terms, failures, load_run
 from spdm_experiments.report_page import Players, render
 from spdm_experiments.runtime import configure_jax
 from spdm_experiments.terminal import print_files
@@ -39,10 +39,15 @@ def _players(options: Report, runs: list[Run]) -> Players | None:
     if not options.players:
         return None
     configure_jax(options)
-    from spdm_experiments.report_scenes import make_players
+    if common_terms(runs).command == "simulate":
+        from spdm_experiments.report_drives import make_drives
 
-    print(f"planning up to {options.players} scenes for the player ...", file=sys.stderr)
-    players = make_players(runs, options.players, options.scenes)
+        players = make_drives(runs, options.players, options.scenes)
+    else:
+        from spdm_experiments.report_scenes import make_players
+
+        print(f"planning up to {options.players} scenes for the player ...", file=sys.stderr)
+        players = make_players(runs, options.players, options.scenes)
     for note in players.notes if players.page is None else players.notes[1:]:
         print(f"note: {note}", file=sys.stderr)
     return players
@@ -52,4 +57,4 @@ def _in_words(run: Run) -> str:
     failed = len({row["token"] for row in failures(run)})
     points, total = len(run.points), run.about["num_scenarios"]
     text = f"{run.folder}: {points} grid points, {total} scenarios, {failed} failed"
-    return text + (f", {run.missing} missing (the sweep is not finished)" if run.missing else "")
+    return text + (f", {run.missing} missing (the run is not finished)" if run.missing else "")

@@ -1,10 +1,11 @@
-"""Run folders of `spdm sweep` as numbers: means, bootstrap intervals, paired differences.
+"""Run folders of `spdm sweep` and `spdm simulate` as numbers: means, intervals, differences.
 
 Failed scenarios are counted and never averaged in. Everything is deterministic for a seed.
 """
 
+import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,26 +14,13 @@ import numpy as np
 import polars
 
 from spdm_experiments.report_grid import frozen, varied
-
-TERMS: Final = {
-    "total": "Total score",
-    "no_at_fault_collision": "No at-fault collision",
-    "drivable_area": "Drivable area",
-    "driving_direction": "Driving direction",
-    "progress": "Progress",
-    "time_to_collision": "Time to collision",
-    "comfort": "Comfort",
-}
-SHORT: Final = dict(zip(TERMS, ("Score", "NC", "DAC", "DDC", "EP", "TTC", "C"), strict=True))
-METRES: Final = "progress_raw"
-"""Progress in metres, the one mean that is no score."""
+from spdm_experiments.report_terms import Terms, needed, terms_of
 
 RESAMPLES: Final = 2000
 TIE: Final = 1e-4
 """Totals of one scenario that differ by less count as equal: float32 on two devices does."""
 _BLOCK = 4_000_000  # numbers of one block of resamples
 _FORMAT = 1
-_NEEDED = ("token", "point", "planner", "num_proposals", "status", "reason", *TERMS, METRES)
 
 
 @dataclass(frozen=True)
@@ -55,6 +43,11 @@ class Run:
     def points(self) -> list[dict[str, Any]]:
         """Grid points; the place of one is its number in the rows."""
         return self.about["points"]
+
+    @property
+    def terms(self) -> Terms:
+        """Scores that its rows hold."""
+        return terms_of(self.about)
 
     @property
     def missing(self) -> int:
@@ -116,31 +109,33 @@ def load_run(folder: Path) -> Run:
     """Reads a run folder, finished or not.
 
     Args:
-      folder: written by `spdm sweep`.
+      folder: written by `spdm sweep` or `spdm simulate`.
 
     Raises:
       ValueError: it is no such folder, has no rows yet, or holds a scenario twice.
     """
     about = _read_about(folder)
+    terms = terms_of(about)
     parts = sorted((folder / "rows").glob("part-*.parquet"))
     if not parts:
         raise ValueError(
             f"{folder}: no rows/part-*.parquet yet, so there is nothing to report; run the same "
-            "spdm sweep command until its first chunk is finished"
+            f"spdm {terms.command} command until its first chunk is finished"
         )
-    frames = [_read_parquet(path) for path in parts]
+    # A drive's score is called so in its rows; the page knows the total by one name.
+    frames = [_read_parquet(path).rename({"score": "total"}, strict=False) for path in parts]
     for path, frame in zip(parts, frames, strict=True):
-        if lacking := [name for name in _NEEDED if name not in frame.columns]:
+        if lacking := [name for name in needed(terms) if name not in frame.columns]:
             raise ValueError(
                 f"{path}: no column {lacking[0]!r}; the file is of another program or version, "
-                "sweep into another folder"
+                f"{terms.command} into another folder"
             )
     rows = polars.concat(frames, how="diagonal_relaxed").sort("point", "token")
     twice = rows.filter(polars.struct("point", "token").is_duplicated())
     if len(twice):
         raise ValueError(
             f"{folder}: scenario {twice['token'][0]!r} occurs twice at grid point "
-            f"{twice['point'][0]}; two sweeps wrote into one folder, sweep into another one"
+            f"{twice['point'][0]}; two runs wrote into one folder, {terms.command} into another one"
         )
     stages = folder / "stages.parquet"
     return Run(folder, about, rows, _read_parquet(stages) if stages.exists() else None)
@@ -148,29 +143,30 @@ def load_run(folder: Path) -> Run:
 
 def _read_about(folder: Path) -> dict[str, Any]:
     path = folder / "run.json"
+    verbs = "spdm sweep or spdm simulate"
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder; name one that spdm sweep has written")
+        raise ValueError(f"{folder}: no such folder; name one that {verbs} has written")
     if not path.is_file():
-        raise ValueError(f"{folder}: no run.json, so no run folder; name one of spdm sweep")
+        raise ValueError(f"{folder}: no run.json, so no run folder; name one of {verbs}")
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: not valid JSON ({error}); sweep again") from error
     command = about.get("command") if isinstance(about, dict) else None
-    if command != "sweep":
+    if command not in ("sweep", "simulate"):
         raise ValueError(
-            f"{path}: written by spdm {command}; spdm report reads what spdm sweep has written"
+            f"{path}: written by spdm {command}; spdm report reads what {verbs} has written"
             if command
-            else f"{path}: does not say that spdm sweep wrote it; name a folder of spdm sweep"
+            else f"{path}: does not say that {verbs} wrote it; name a folder of those"
         )
     if about.get("format") != _FORMAT:
         raise ValueError(
             f"{path}: format is {about.get('format')!r}, this version reads {_FORMAT}; report with "
-            "the version that swept, or sweep again"
+            f"the version that wrote it, or {command} again"
         )
     for name in ("points", "num_scenarios"):
         if name not in about:
-            raise ValueError(f"{path}: no field {name!r}; sweep again")
+            raise ValueError(f"{path}: no field {name!r}; {command} again")
     return about
 
 
@@ -179,6 +175,24 @@ def _read_parquet(path: Path) -> polars.DataFrame:
         return polars.read_parquet(path)
     except polars.exceptions.PolarsError as error:
         raise ValueError(f"{path}: damaged ({error}); delete it and sweep again") from error
+
+
+def common_terms(runs: Sequence[Run]) -> Terms:
+    """Returns what the page shows of all runs; a score that one of them lacks is left out.
+
+    Raises:
+      ValueError: the runs are of different verbs.
+    """
+    first, *rest = (run.terms for run in runs)
+    for other in rest:
+        if other.command != first.command:
+            raise ValueError(
+                f"{runs[0].folder} was written by spdm {first.command} and {runs[1].folder} by "
+                f"spdm {other.command}; their scores are not comparable"
+            )
+        titles = {name: title for name, title in first.titles.items() if name in other.titles}
+        first = dataclasses.replace(first, titles=titles)
+    return first
 
 
 # ---- means and intervals ----
@@ -214,7 +228,7 @@ def bootstrap(values: np.ndarray, seed: int) -> np.ndarray:
 
 def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
     """Returns one summary per grid point; scenarios that failed are counted only."""
-    names = [*TERMS, METRES]
+    names = run.terms.columns()
     found = []
     for point in range(len(run.points)):
         good = run.usable(point)
@@ -303,34 +317,6 @@ def largest_losses(
     """Returns the rows in which the first run falls furthest behind the second, worst first."""
     found = pair_up(first, second, points).filter(polars.col("difference") < -TIE)
     return found.sort("difference", "token").head(count)
-
-
-def first_lost(row: Mapping[str, Any]) -> tuple[str, str]:
-    """Returns the first term that the chosen proposal lost, and the reason; empty if none.
-
-    The order is that of the rules: what sets the total to zero comes first.
-    """
-    if row["no_at_fault_collision"] < 1:
-        return "no_at_fault_collision", "at-fault collision" + _blame(row, "collision")
-    if row["drivable_area"] < 1:
-        return "drivable_area", "a corner leaves the drivable area"
-    if row["driving_direction"] < 1:
-        return "driving_direction", "drives off the route's lanes or against traffic"
-    if row["time_to_collision"] < 1:
-        return "time_to_collision", "less than 1 s to a collision" + _blame(row, "ttc")
-    if row["comfort"] < 1:
-        return "comfort", "uncomfortable: acceleration, jerk or yaw beyond the bounds"
-    if row["progress"] < 1 - 1e-6:
-        share = 100 * row["progress"]
-        return "progress", f"{row[METRES]:.1f} m, {share:.0f} % of the best admissible proposal"
-    return "", ""
-
-
-def _blame(row: Mapping[str, Any], kind: str) -> str:
-    """Says with whom and when, as far as the row knows."""
-    agent, time = row.get(f"{kind}_agent"), row.get(f"{kind}_time")
-    text = f" with {agent}" if agent else ""
-    return text + (f" at {time:.1f} s" if time is not None and np.isfinite(time) else "")
 
 
 def failures(run: Run) -> list[dict[str, Any]]:

@@ -48,7 +48,8 @@ def distinguishing(points: Sequence[Mapping[str, Any]]) -> list[str]:
 def label(point: Mapping[str, Any], keys: Iterable[str]) -> str:
     """Names a grid point by some of its parameters: "SPDM 60, idm.headway_time 1.5"."""
     keys = list(keys)
-    words = [str(point[key]) for key in ("planner", "num_proposals") if key in keys]
+    names = [point[key] for key in ("planner", "num_proposals") if key in keys]
+    words = [str(name) for name in names if name is not None]
     rest = [f"{key} {plain(point.get(key))}" for key in keys if key not in _NAMED]
     return ", ".join([*([" ".join(words)] if words else []), *rest])
 
@@ -63,15 +64,27 @@ def plain(value: Any) -> str:
 
 
 def axes(points: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the parameters that lines may run along: numbers that vary, N_p first."""
+    """Returns the parameters that lines may run along: numbers that vary, N_p first.
+
+    Some planners make no proposals; the others still have lines along N_p.
+    """
     number = lambda value: isinstance(value, int | float) and not isinstance(value, bool)
-    keys = [key for key in varied(points) if all(number(point.get(key)) for point in points)]
+
+    def numeric(key: str) -> bool:
+        values = [point.get(key) for point in points]
+        if key == "num_proposals":
+            values = [value for value in values if value is not None]
+        return bool(values) and all(number(value) for value in values)
+
+    keys = [key for key in varied(points) if numeric(key)]
     keys.sort(key=lambda key: key != "num_proposals")
     return keys or ["num_proposals"]
 
 
 def lines(points: Sequence[Mapping[str, Any]], axis: str) -> list[Line]:
     """Groups grid points into lines along a parameter.
+
+    A point without N_p is the same all along that axis: its line is level.
 
     Args:
       points: of one run.
@@ -82,8 +95,13 @@ def lines(points: Sequence[Mapping[str, Any]], axis: str) -> list[Line]:
     names: dict[str, list[int]] = {}
     for number, point in enumerate(points):
         names.setdefault(label(point, keys), []).append(number)
+    known = [float(p[axis]) for p in points if p[axis] is not None] or [0.0]
     found = []
     for name, members in names.items():
+        if any(points[number][axis] is None for number in members):
+            ends = sorted({min(known), max(known)})
+            found += [Line(name, [number] * len(ends), ends) for number in members]
+            continue
         members.sort(key=lambda number: points[number][axis])
         found.append(Line(name, members, [float(points[number][axis]) for number in members]))
     return found

@@ -14,7 +14,8 @@ import polars
 
 from spdm_experiments import report_data as numbers
 from spdm_experiments import report_grid as grid
-from spdm_experiments.report_data import METRES, SHORT, TERMS, PointSummary, Run
+from spdm_experiments.report_data import PointSummary, Run
+from spdm_experiments.report_terms import Terms
 
 LINE_COLORS: Final = (
     "#0072b2",
@@ -100,23 +101,26 @@ def page_data(
       players: see `render`.
     """
     players = players or Players()
+    terms = numbers.common_terms(runs)
     names = run_names(runs)
     summaries = [numbers.summarise(run, seed) for run in runs]
     pairs = numbers.common_points(*runs) if len(runs) == 2 else []
     titles = [_titles(run) for run in runs]
     # Grid points of both runs stand in one list; `start` is where each run's begin.
     start = [0, len(runs[0].points)]
-    dots, sampled = _dots(runs)
+    dots, sampled = _dots(runs, list(terms.titles))
     keys = dict.fromkeys(key for run in runs for key in grid.distinguishing(run.points))
     return {
-        "title": "Sweep report: " + " and ".join(names),
+        "title": f"{terms.title}: " + " and ".join(names),
         "runs": [
             {"name": name, "about": _about(run), "notes": _notes(run)}
             for run, name in zip(runs, names, strict=True)
         ],
         "notes": _comparison_notes(runs, names),
-        "terms": [{"key": k, "title": TERMS[k], "short": SHORT[k]} for k in TERMS],
-        "metres": METRES,
+        "terms": [{"key": k, "title": t, "short": terms.short[k]} for k, t in terms.titles.items()],
+        "metres": terms.metres,
+        "words": {"summary": terms.summary, "score": terms.score, "command": terms.command},
+        "braking": terms.braking,
         "parameters": [{"key": key, "title": _title(key)} for key in keys],
         "points": [
             _point(run, summary, number, title, keys)
@@ -168,7 +172,7 @@ def _about(run: Run) -> list[list[str]]:
     fixed = [key for key in run.points[0] if key not in grid.varied(run.points)]
     for key in fixed:
         if key not in ("point", *entries):
-            entries[key] = grid.plain(run.points[0][key])
+            entries[key] = _parameter(run.points[0], key)
     return [[key.replace("_", " "), str(v)] for key, v in entries.items() if v not in (None, "")]
 
 
@@ -177,8 +181,8 @@ def _notes(run: Run) -> list[str]:
     if run.missing:
         total = run.about["num_scenarios"]
         notes.append(
-            f"Not finished: {run.missing} of {total} scenarios are missing. The same spdm sweep "
-            "command goes on where it stopped; this page shows what is there."
+            f"Not finished: {run.missing} of {total} scenarios are missing. The same spdm "
+            f"{run.terms.command} command goes on where it stopped; this page shows what is there."
         )
     counts = {len(run.usable(point)) for point in range(len(run.points))}
     if len(counts) > 1:
@@ -223,7 +227,7 @@ def _point(
     return {
         "run": number,
         "title": title,
-        "parameters": {key: grid.plain(point.get(key)) for key in keys},
+        "parameters": {key: _parameter(point, key) for key in keys},
         "scenarios": summary.scenarios,
         "failed": summary.failed,
         "means": {key: _number(value) for key, value in summary.means.items()},
@@ -231,6 +235,11 @@ def _point(
         "braking": _number(summary.braking),
         "ms": _number(summary.ms),
     }
+
+
+def _parameter(point: Mapping[str, Any], key: str) -> str:
+    # A point of another run may lack a setting; a planner may have no such thing.
+    return "–" if key in point and point[key] is None else grid.plain(point.get(key))
 
 
 def _paired(found: numbers.PairedDifference, start: Sequence[int]) -> dict[str, Any]:
@@ -292,7 +301,7 @@ def stage_table(run: Run) -> polars.DataFrame:
     )
 
 
-def _dots(runs: Sequence[Run]) -> tuple[list[dict[str, Any]], int]:
+def _dots(runs: Sequence[Run], names: list[str]) -> tuple[list[dict[str, Any]], int]:
     """Returns scores per scenario for the scatter, and how many scenarios there are in all.
 
     `values[p][t]` is the score of term t at point p of the page's list, None where there is none.
@@ -305,13 +314,13 @@ def _dots(runs: Sequence[Run]) -> tuple[list[dict[str, Any]], int]:
     place = {token: number for number, token in enumerate(tokens.tolist())}
     kinds = [""] * len(tokens)
     count = sum(len(run.points) for run in runs)
-    values = np.full((len(tokens), count, len(TERMS)), np.nan)
+    values = np.full((len(tokens), count, len(names)), np.nan)
     point = 0
     for run in runs:
         for number in range(len(run.points)):
             rows = run.usable(number).filter(polars.col("token").is_in(tokens.tolist()))
             at = [place[token] for token in rows["token"]]
-            values[at, point] = rows.select(list(TERMS)).cast(polars.Float64).to_numpy()
+            values[at, point] = rows.select(names).cast(polars.Float64).to_numpy()
             for where, kind in zip(at, _column(rows, "scenario_type"), strict=True):
                 kinds[where] = kind or ""
             point += 1
@@ -341,7 +350,13 @@ def _lists(
     for pair in reversed(pairs):
         rows = numbers.largest_losses(runs[0], runs[1], pair, count)
         name = f"Largest losses of A against B: {titles[0][pair[0]]}"
-        found.append({"name": name, "compared": True, "rows": [_scene(r) for r in rows.to_dicts()]})
+        found.append(
+            {
+                "name": name,
+                "compared": True,
+                "rows": [_scene(r, runs[0].terms) for r in rows.to_dicts()],
+            }
+        )
     for number, run in enumerate(runs):
         # The last point is the largest of the last planner: what most people look for first.
         for point in reversed(range(len(run.points))):
@@ -351,14 +366,14 @@ def _lists(
                 {
                     "name": f"Worst of {letter}{titles[number][point]}",
                     "compared": False,
-                    "rows": [_scene(row) for row in rows.to_dicts()],
+                    "rows": [_scene(row, run.terms) for row in rows.to_dicts()],
                 }
             )
     return found
 
 
-def _scene(row: Mapping[str, Any]) -> dict[str, Any]:
-    term, reason = numbers.first_lost(row)
+def _scene(row: Mapping[str, Any], terms: Terms) -> dict[str, Any]:
+    term, reason = terms.first_lost(row)
     return {
         "token": row["token"],
         "type": row.get("scenario_type") or "",
@@ -366,7 +381,7 @@ def _scene(row: Mapping[str, Any]) -> dict[str, Any]:
         "total": _number(row["total"]),
         "other": _number(row.get("other")),
         "difference": _number(row.get("difference")),
-        "term": TERMS.get(term, ""),
+        "term": terms.titles.get(term, ""),
         "reason": reason,
         "braking": bool(row.get("emergency_brake")),
     }

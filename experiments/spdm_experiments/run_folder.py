@@ -1,8 +1,9 @@
-"""The folder of a sweep: described once, filled part by part, never changed afterwards.
+"""The folder of a run: described once, filled part by part, never changed afterwards.
 
     RUN/run.json                 # what is computed; every later start is compared with it
     RUN/rows/part-*.parquet      # one per finished chunk
-    RUN/trajectories/part-*.npz  # on request
+    RUN/trajectories/part-*.npz  # on request, of a sweep
+    RUN/histories/part-*.npz     # on request, of a simulation
     RUN/progress-*.json          # times and counts of the processes that worked on it
 
 Every file appears whole, by rename, and a part of rows is the last thing written of its chunk: what
@@ -28,7 +29,8 @@ from spdm_jax.io.scenario_file import write_atomically
 
 RUN = "run.json"
 ROWS = "rows"
-TRAJECTORIES = "trajectories"
+ARRAYS = ("trajectories", "histories")
+"""Folders of arrays that lie beside the rows, if asked for; a run has one of them or none."""
 FORMAT = 1
 COMPARED = (
     "format",
@@ -46,12 +48,13 @@ NOTED = ("commit", "device")
 """Entries whose change is only mentioned."""
 
 
-def open_run(folder: Path, about: Mapping[str, Any]) -> list[str]:
+def open_run(folder: Path, about: Mapping[str, Any], arrays: str | None) -> list[str]:
     """Describes a new run, or checks that this is the one that the folder holds.
 
     Args:
       folder: made if absent.
       about: run.json.
+      arrays: one of `ARRAYS`, or None.
 
     Returns:
       What is different without consequence, in words.
@@ -64,7 +67,7 @@ def open_run(folder: Path, about: Mapping[str, Any]) -> list[str]:
         raise ValueError(f"{folder}: has rows but no {RUN} that says of what; use another --out")
     folder.mkdir(parents=True, exist_ok=True)
     notes = describe(path, about, COMPARED, NOTED)
-    for name in (ROWS, TRAJECTORIES) if about["config"]["trajectories"] else (ROWS,):
+    for name in (ROWS, arrays) if arrays else (ROWS,):
         (folder / name).mkdir(exist_ok=True)
     return notes
 
@@ -106,10 +109,11 @@ def alone(folder: Path, shard: Shard) -> Iterator[None]:
 
 def clean(folder: Path, shard: Shard) -> None:
     """Removes what a killed process of this shard left half done."""
-    clean_parts(folder / ROWS, folder / TRAJECTORIES, shard)
+    for arrays in ARRAYS:
+        clean_parts(folder / ROWS, folder / arrays, shard)
 
 
-def read_done(folder: Path, num_points: int) -> tuple[dict[str, bool], list[str]]:
+def read_done(folder: Path, num_points: int) -> tuple[dict[str, str], list[str]]:
     """Reads which scenarios have rows; see `parts.read_parts`.
 
     Args:
@@ -117,24 +121,29 @@ def read_done(folder: Path, num_points: int) -> tuple[dict[str, bool], list[str]
       num_points: rows per scenario.
 
     Returns:
-      Token -> whether all its rows are "ok", and what the user should know.
+      Token -> why its rows are not all "ok" ("" where they are), and what the user should know.
     """
 
-    def read(path: Path) -> Iterator[tuple[str, bool]]:
-        part = polars.read_parquet(path, columns=["token", "point", "status"])
+    def read(path: Path) -> Iterator[tuple[str, str]]:
+        part = polars.read_parquet(path, columns=["token", "point", "status", "reason"])
+        bad = polars.col("status") != "ok"
         rows = part.group_by("token", maintain_order=True).agg(
             polars.col("point").sort().alias("points"),
-            (polars.col("status") == "ok").all().alias("ok"),
+            polars.col("reason").filter(bad).first().fill_null("").alias("reason"),
         )
         if any(points != list(range(num_points)) for points in rows["points"].to_list()):
             raise ValueError(f"not one row for each of {num_points} points")
-        return zip(rows["token"], rows["ok"], strict=True)
+        return zip(rows["token"], rows["reason"], strict=True)
 
     return read_parts(folder / ROWS, read, "not readable")
 
 
 def write_part(
-    folder: Path, name: str, rows: polars.DataFrame, poses: Mapping[str, np.ndarray] | None
+    folder: Path,
+    name: str,
+    rows: polars.DataFrame,
+    arrays: Mapping[str, np.ndarray],
+    kind: str | None,
 ) -> None:
     """Writes a finished chunk, its rows last.
 
@@ -142,13 +151,15 @@ def write_part(
       folder: of the run.
       name: of the part, without ending.
       rows: one per scenario and point.
-      poses: arrays of the trajectories file, or None.
+      arrays: what lies beside them; nothing is written where there are none.
+      kind: where that goes, one of `ARRAYS`; None for a run without.
     """
-    if poses is not None:
+    if arrays:
+        assert kind in ARRAYS
         buffer = io.BytesIO()
-        arrays: dict[str, Any] = dict(poses)
-        np.savez_compressed(buffer, **arrays)
-        write_atomically(folder / TRAJECTORIES / f"{name}.npz", buffer.getvalue())
+        content: dict[str, Any] = dict(arrays)
+        np.savez_compressed(buffer, **content)
+        write_atomically(folder / kind / f"{name}.npz", buffer.getvalue())
     buffer = io.BytesIO()
     rows.write_parquet(buffer)
     write_atomically(folder / ROWS / f"{name}.parquet", buffer.getvalue())

@@ -79,9 +79,7 @@ def open_source(options: Pack) -> tuple[Reader, list[str]]:
         )
         wanted = options.token
     else:
-        from spdm_jax.synthetic import SyntheticReader
-
-        reader = SyntheticReader(_scene_names(options.source), options.seeds)
+        reader = _built_in(options)
         wanted = options.token
     return Selection(reader, wanted, options.limit), notes
 
@@ -104,14 +102,26 @@ def detect_format(source: str) -> Format:
     if path.exists():
         raise ValueError(f"{source}: not a nuPlan log (.db) and not a folder; name --format")
     from spdm_jax.synthetic import scene_names
+    from spdm_jax.synthetic.suites import suite_names
 
-    names = list(scene_names())
+    names = [*scene_names(), *suite_names()]
     if source == "all" or set(_split(source)) & set(names):
         return "synthetic"
     raise ValueError(
-        f"{source}: no such file or folder, and no built-in scene; the scenes are "
+        f"{source}: no such file or folder, and no built-in scene or suite; there are "
         f"{', '.join(names)}"
     )
+
+
+def _built_in(options: Pack) -> Reader:
+    """Opens a suite, or built-in scenes."""
+    from spdm_jax.synthetic import SyntheticReader
+    from spdm_jax.synthetic.suites import SuiteReader, suite_names
+
+    if options.source in suite_names():
+        given = options.seeds != Pack.seeds
+        return SuiteReader(options.source, options.seeds) if given else SuiteReader(options.source)
+    return SyntheticReader(_scene_names(options.source), options.seeds)
 
 
 def _scene_names(source: str) -> list[str]:

@@ -135,9 +135,13 @@ def runs_of(points: Sequence[Point]) -> list[Run]:
 
 
 def varying(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the names of settings that differ between points, planner and N_p apart."""
+    """Returns the names of settings that differ between points, planner and N_p apart.
+
+    A planner that has no such setting (None) does not make it one that differs.
+    """
     names = [n for n in entries[0] if n not in ("point", "planner", "num_proposals")]
-    return [n for n in names if len({repr(entry[n]) for entry in entries}) > 1]
+    values = lambda name: {repr(entry[name]) for entry in entries if entry[name] is not None}
+    return [name for name in names if len(values(name)) > 1]
 
 
 def read_grids(path: Path) -> list[dict[str, list[Any]]]:
@@ -271,11 +275,19 @@ def check_name(name: str) -> None:
 def _product(grid: Mapping[str, list[Any]], swept: Sequence[str]) -> Iterable[Point]:
     names = list(grid)
     for values in itertools.product(*grid.values()):
-        yield _point(dict(zip(names, values, strict=True)), swept)
+        yield point_of(dict(zip(names, values, strict=True)), swept)
 
 
-def _point(chosen: Mapping[str, Any], swept: Sequence[str]) -> Point:
-    """Makes one point; raises ValueError where planner and settings do not fit."""
+def point_of(chosen: Mapping[str, Any], swept: Sequence[str] = ()) -> Point:
+    """Makes one point.
+
+    Args:
+      chosen: axis or settable name -> value; the rest is the planner's own.
+      swept: settable names that the point's entry is to hold.
+
+    Raises:
+      ValueError: planner and settings do not fit.
+    """
     short = chosen.get("planner", "spdm")
     config = PlannerConfig(
         **{n: chosen[n] for n in ("tracker", "forecast", "progress_reference") if n in chosen}

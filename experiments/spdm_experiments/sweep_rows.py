@@ -1,7 +1,6 @@
-"""Rows of a sweep: one per scenario and point, always of the same columns."""
+"""Rows of a sweep: what was chosen at a point and how it scores."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,103 +8,41 @@ import polars
 
 from spdm_experiments.inventory import Entry
 from spdm_experiments.record import REASONS
-from spdm_experiments.sweep_grid import varying
+from spdm_experiments.rows import REAL, TEXT, WHOLE, Layout, identity
 from spdm_experiments.sweep_scene import Reading
-from spdm_jax import Failure
 from spdm_jax.results import SCORE_COLUMNS
 
-_TEXT, _WHOLE, _REAL = polars.String, polars.Int32, polars.Float32
-_IDENTITY = {"token": _TEXT, "log_name": _TEXT, "map_name": _TEXT, "scenario_type": _TEXT}
-_POINT = {"point": _WHOLE, "planner": _TEXT, "num_proposals": _WHOLE}
-_CHOICE = {
-    "num_valid": _WHOLE,
-    "best": _WHOLE,
-    "stage": _WHOLE,
-    "path": _WHOLE,
-    "policy": _WHOLE,
-    "target_speed": _REAL,
-    "total": _REAL,
-    "no_at_fault_collision": _REAL,
-    "drivable_area": _REAL,
-    "driving_direction": _REAL,
-    "progress": _REAL,
-    "time_to_collision": _REAL,
-    "comfort": _REAL,
-    "progress_raw": _REAL,
-    "progress_centerline": _REAL,
-    "progress_goal": _REAL,
-    "collision_time": _REAL,
-    "ttc_time": _REAL,
-    "collision_agent": _TEXT,
-    "ttc_agent": _TEXT,
+CHOICE = {
+    "num_valid": WHOLE,
+    "best": WHOLE,
+    "stage": WHOLE,
+    "path": WHOLE,
+    "policy": WHOLE,
+    "target_speed": REAL,
+    "total": REAL,
+    "no_at_fault_collision": REAL,
+    "drivable_area": REAL,
+    "driving_direction": REAL,
+    "progress": REAL,
+    "time_to_collision": REAL,
+    "comfort": REAL,
+    "progress_raw": REAL,
+    "progress_centerline": REAL,
+    "progress_goal": REAL,
+    "collision_time": REAL,
+    "ttc_time": REAL,
+    "collision_agent": TEXT,
+    "ttc_agent": TEXT,
     "emergency_brake": polars.Boolean,
-    "mean_total": _REAL,
-    "run_ms": _REAL,
+    "mean_total": REAL,
+    "run_ms": REAL,
 }
 """Columns that are null where a scenario failed."""
-_OUTCOME = {"status": _TEXT, "reason": _TEXT}
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Columns of a sweep's rows.
-
-    Attributes:
-      points: the points as run.json holds them.
-      names: settings that differ between them; each is a column.
-    """
-
-    points: Sequence[Mapping[str, Any]]
-    names: Sequence[str]
-
-    @staticmethod
-    def of(points: Sequence[Mapping[str, Any]]) -> "Layout":
-        """Returns the layout for the entry "points" of run.json."""
-        return Layout(points, varying(points))
-
-    @property
-    def schema(self) -> dict[str, Any]:
-        """Column -> type."""
-        text = lambda name: isinstance(self.points[0][name], str | list)
-        settings = {name: _TEXT if text(name) else polars.Float64 for name in self.names}
-        return {**_IDENTITY, **_POINT, **settings, **_CHOICE, **_OUTCOME}
-
-    def point(self, number: int) -> dict[str, Any]:
-        """Returns what all rows of a point have in common."""
-        entry = self.points[number]
-        plain = lambda v: ",".join(f"{x:g}" for x in v) if isinstance(v, list) else v
-        return {name: plain(entry[name]) for name in (*_POINT, *self.names)}
-
-    def frame(self, rows: Sequence[Mapping[str, Any]]) -> polars.DataFrame:
-        """Returns rows as a table; what a row lacks is null."""
-        schema = self.schema
-        columns = {name: [row.get(name) for row in rows] for name in schema}
-        return polars.DataFrame(columns, schema=schema)
-
-
-def identity(entry: Entry) -> dict[str, Any]:
-    """Returns the columns that say which scenario a row is of."""
-    return {name: getattr(entry, name) for name in _IDENTITY}
-
-
-def failed_rows(layout: Layout, failures: Sequence[tuple[Failure, Entry | None]]) -> list[dict]:
-    """Returns a row per point for scenarios that could not be computed.
-
-    Args:
-      layout: columns.
-      failures: with what is known of the scenario.
-    """
-    return [
-        {
-            "token": failure.token,
-            **(identity(entry) if entry else {}),
-            **layout.point(number),
-            "status": "failed",
-            "reason": failure.reason,
-        }
-        for failure, entry in failures
-        for number in range(len(layout.points))
-    ]
+def layout_of(points: Sequence[Mapping[str, Any]]) -> Layout:
+    """Returns the columns for the entry "points" of run.json."""
+    return Layout.of(points, CHOICE)
 
 
 def scored_rows(
@@ -126,7 +63,7 @@ def scored_rows(
       points: `[C]` points that were read.
       run_ms: of one scenario.
     """
-    values = {name: getattr(reading, name) for name in _CHOICE if hasattr(reading, name)}
+    values = {name: getattr(reading, name) for name in CHOICE if hasattr(reading, name)}
     values |= {name: reading.scores[name] for name in SCORE_COLUMNS}
     rows = []
     for i, entry in enumerate(entries):

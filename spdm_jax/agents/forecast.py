@@ -4,14 +4,15 @@ A forecaster is any function `(observation, selected, future) -> ForecastPoses`;
 needs besides (nothing, the recorded tracks, or a model's output).
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from spdm_jax.agents.observation import Observation, SelectedObjects, is_agent
-from spdm_jax.config import FORECAST_DT, NUM_FORECAST
-from spdm_jax.types import AgentForecast, Array, Tracks
+from spdm_jax.config import DT, FORECAST_DT, NUM_FORECAST
+from spdm_jax.types import AgentForecast, Array, EgoState, Tracks
 
 
 class ForecastPoses(NamedTuple):
@@ -21,6 +22,13 @@ class ForecastPoses(NamedTuple):
     y: Array
     heading: Array
     valid: Array
+
+
+React: TypeAlias = Callable[[EgoState], ForecastPoses]
+"""How all tracks would move beside each of some drives of the ego.
+
+From rear-axle states `[P, T]`, 0.1 s apart from now on, to poses `[P, A, S]`.
+"""
 
 
 def constant_velocity(observation: Observation, selected: SelectedObjects) -> ForecastPoses:
@@ -75,6 +83,16 @@ def perfect(observation: Observation, selected: SelectedObjects, tracks: Tracks)
 def supplied(poses: ForecastPoses, selected: SelectedObjects) -> ForecastPoses:
     """Picks the selected rows of a forecast given for all tracks (`[A, S]` fields)."""
     return jax.tree.map(lambda values: values[selected.track], poses)
+
+
+def steady_ego(ego: EgoState, num_states: int) -> EgoState:
+    """The ego going straight on at its speed, `[1, num_states]`, 0.1 s apart."""
+    way = jnp.arange(num_states, dtype=ego.x.dtype) * (DT * ego.vx)
+    states = jax.tree.map(lambda v: jnp.broadcast_to(v, (1, num_states)), ego)
+    return states.replace(
+        x=(ego.x + way * jnp.cos(ego.heading))[None],
+        y=(ego.y + way * jnp.sin(ego.heading))[None],
+    )
 
 
 def assemble(

@@ -30,14 +30,13 @@ from spdm_jax.interplan.spawn import (
 )
 from spdm_jax.io.map_query import MapQuery
 from spdm_jax.io.raw import RawScenario, RawTracks, ScenarioError
+from spdm_jax.simulation.script import WALK_ITERATIONS
 from spdm_jax.types import ObjectType
 
 PEDESTRIAN_SIZE = (0.9, 0.7914)
 """Length and width, m."""
 CONE_SIZE = (0.5, 0.5)
 """Length and width, m."""
-WALK_ITERATIONS = 150
-"""A pedestrian walks for so many iterations more than it waited, at most for the whole scenario."""
 END_MARGIN = 0.1
 """A run ends so far before the goal, m."""
 _SPEED, _POSE = 3, slice(0, 3)  # columns of `RawScenario.ego`

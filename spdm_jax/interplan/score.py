@@ -13,9 +13,10 @@ from spdm_jax.config import VehicleParams
 from spdm_jax.interplan.config import SPECIAL_TYPES, ObstacleKind
 from spdm_jax.interplan.extras import InterplanExtras
 from spdm_jax.metrics import SCORED, ClosedLoopMetrics, Expert, MetricParams
-from spdm_jax.metrics.motion import areas_at, motion
+from spdm_jax.metrics.motion import motion
 from spdm_jax.metrics.routes import driven_route
 from spdm_jax.metrics.score import NUM_MULTIPLIERS
+from spdm_jax.scoring.areas import areas_at
 from spdm_jax.types import Lanes, Polylines, ScenarioMap
 
 LANE_CHANGES = "lane_changes_to_goal"

@@ -16,7 +16,7 @@ from spdm_jax.metrics.collisions import (
 )
 from spdm_jax.metrics.comfort import Comfort, comfort
 from spdm_jax.metrics.driving import DrivingDirection, SpeedLimit, driving_direction, speed_limit
-from spdm_jax.metrics.motion import Areas, Motion, areas_at, motion
+from spdm_jax.metrics.motion import Motion, motion
 from spdm_jax.metrics.params import MetricConfig, MetricParams
 from spdm_jax.metrics.progress import Progress, expert_chain, progress
 from spdm_jax.metrics.routes import (
@@ -28,6 +28,7 @@ from spdm_jax.metrics.routes import (
 )
 from spdm_jax.metrics.score import score
 from spdm_jax.metrics.series import Summary, summarize
+from spdm_jax.scoring.areas import Areas, areas_at
 from spdm_jax.simulation.history import History
 from spdm_jax.types import Array, EgoState, ScenarioMap
 

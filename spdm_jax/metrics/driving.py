@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from spdm_jax.arrays import prefix_sum
+from spdm_jax.map_rows import arc_length_at
 from spdm_jax.metrics.motion import Motion
 from spdm_jax.metrics.params import MetricParams
 from spdm_jax.metrics.routes import first_of
 from spdm_jax.metrics.series import seconds
-from spdm_jax.metrics.shapes import arc_length_at
 from spdm_jax.types import Array, Lanes
 
 

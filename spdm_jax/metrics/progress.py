@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from spdm_jax.arrays import prefix_sum, true_indices
+from spdm_jax.map_rows import arc_length_at, line_ends, polygon_contains
 from spdm_jax.metrics.driving import last_before
 from spdm_jax.metrics.params import MetricParams
 from spdm_jax.metrics.routes import first_of
-from spdm_jax.metrics.shapes import arc_length_at, line_ends, polygon_contains
 from spdm_jax.types import Array, Lanes, ScenarioMap
 
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from spdm_jax.metrics.motion import Areas
-from spdm_jax.metrics.shapes import polygon_distance
+from spdm_jax.map_rows import polygon_distance
+from spdm_jax.scoring.areas import Areas
 from spdm_jax.types import Lanes
 
 

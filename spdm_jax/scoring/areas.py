@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from spdm_jax.geometry import Box, box_corners
-from spdm_jax.types import EgoState, PolygonGrid
+from spdm_jax.types import EgoState, PolygonGrid, ScenarioMap
 
 
 class AreaMasks(NamedTuple):
@@ -35,6 +35,18 @@ class EgoAreas(NamedTuple):
     multiple_lanes: jax.Array
     non_drivable: jax.Array
     oncoming: jax.Array
+
+
+class Areas(NamedTuple):
+    """Areas that contain points `[...]`.
+
+    Attributes:
+      lanes: `[..., L]` bool, lanes and lane connectors.
+      intersection: `[...]` bool, in some intersection.
+    """
+
+    lanes: jax.Array
+    intersection: jax.Array
 
 
 def pack_bits(flags: jax.Array, words: int) -> jax.Array:
@@ -85,6 +97,20 @@ def containing_polygons(grid: PolygonGrid, x: jax.Array, y: jax.Array) -> tuple[
 
     # The fullest cell that was hit bounds the work.
     return jax.lax.fori_loop(jnp.int32(0), jnp.max(count), flip, tuple(words))
+
+
+def areas_at(scene_map: ScenarioMap, x: jax.Array, y: jax.Array) -> Areas:
+    """Looks points `[...]` up in the map's polygon grid."""
+    words = jnp.stack(containing_polygons(scene_map.grid, x, y), axis=-1)
+
+    def bits(first: int, count: int) -> jax.Array:
+        number = first + jnp.arange(count)
+        return (words[..., number >> 5] >> (number & 31).astype(jnp.uint32)) & 1 == 1
+
+    num_lanes = scene_map.lanes.valid.shape[0]
+    num_car_parks = scene_map.car_parks.count.shape[0]
+    crossings = bits(num_lanes + num_car_parks, scene_map.intersections.count.shape[0])
+    return Areas(bits(0, num_lanes) & scene_map.lanes.valid, jnp.any(crossings, axis=-1))
 
 
 def ego_areas(

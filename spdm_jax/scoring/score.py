@@ -8,8 +8,14 @@ import jax.numpy as jnp
 from spdm_jax.config import DT, ScoringParams, VehicleParams
 from spdm_jax.geometry import Path, ego_box
 from spdm_jax.scoring.aggregate import aggregate
-from spdm_jax.scoring.areas import AreaMasks, ego_areas
-from spdm_jax.scoring.collision import first_contacts, no_at_fault_collision, time_to_collision
+from spdm_jax.scoring.areas import AreaMasks, EgoAreas, ego_areas
+from spdm_jax.scoring.collision import (
+    CollisionResult,
+    TTCResult,
+    first_contacts,
+    no_at_fault_collision,
+    time_to_collision,
+)
 from spdm_jax.scoring.comfort import comfort_flags
 from spdm_jax.scoring.driving import driving_direction, progress
 from spdm_jax.types import AgentForecast, EgoState, PolygonGrid, SubScores
@@ -21,7 +27,7 @@ class World(NamedTuple):
     Attributes:
       grid: point-in-polygon index.
       masks: polygons that count at this step.
-      forecast: objects.
+      forecast: objects `[A, S]`, or `[P, A, S]` poses where they react to each proposal.
       progress_path: where progress is measured.
     """
 
@@ -29,6 +35,43 @@ class World(NamedTuple):
     masks: AreaMasks
     forecast: AgentForecast
     progress_path: Path
+
+
+def _meet(
+    ego: EgoState,
+    areas: EgoAreas,
+    crossing: jax.Array,
+    forecast: AgentForecast,
+    vehicle: VehicleParams,
+    params: ScoringParams,
+) -> tuple[CollisionResult, TTCResult]:
+    """Judges the contacts of proposals `[P, T]` with the same objects `[A, S]`."""
+    contacts = first_contacts(ego, forecast, vehicle, params)
+    collision = no_at_fault_collision(ego, areas, forecast, contacts, vehicle, params)
+    return collision, time_to_collision(ego, areas, crossing, forecast, contacts, params)
+
+
+def _meet_own(
+    ego: EgoState,
+    areas: EgoAreas,
+    crossing: jax.Array,
+    forecast: AgentForecast,
+    vehicle: VehicleParams,
+    params: ScoringParams,
+) -> tuple[CollisionResult, TTCResult]:
+    """Judges the contacts of each proposal with its own future of the objects `[P, A, S]`."""
+    poses = {"x", "y", "heading", "sample_valid"}
+    axes = AgentForecast(
+        **{name: 0 if name in poses else None for name in AgentForecast.__dataclass_fields__}
+    )
+
+    def one(*given):
+        *own, forecast = given
+        ego, areas, crossing = jax.tree.map(lambda v: v[None], tuple(own))
+        met = _meet(ego, areas, crossing, forecast, vehicle, params)
+        return jax.tree.map(lambda v: v[0], met)
+
+    return jax.vmap(one, in_axes=(0, 0, 0, axes))(ego, areas, crossing, forecast)
 
 
 def score_trajectories(
@@ -57,9 +100,8 @@ def score_trajectories(
     with jax.named_scope("areas"):
         areas, crossing = ego_areas(world.grid, world.masks, ego, box)
     with jax.named_scope("contacts"):
-        contacts = first_contacts(ego, world.forecast, vehicle, params)
-        collision = no_at_fault_collision(ego, areas, world.forecast, contacts, vehicle, params)
-        ttc = time_to_collision(ego, areas, crossing, world.forecast, contacts, params)
+        meet = _meet if world.forecast.x.ndim == 2 else _meet_own
+        collision, ttc = meet(ego, areas, crossing, world.forecast, vehicle, params)
     with jax.named_scope("progress"):
         raw = progress(world.progress_path, box.x, box.y)
     with jax.named_scope("comfort"):

@@ -45,12 +45,14 @@ class Outlook(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """Everything on the road: agents `[K]`, the ego, replayed objects `[R]`, stop polygons `[Q]`.
+    """Everything on the road, one after the other.
+
+    Agents `[K]`, the ego's boxes `[E]`, replayed objects `[R]` and stop polygons `[Q]`; together N.
 
     Attributes:
-      shape: `Blocks` `[K + 1 + R + Q]`.
-      circle: `[K + 1 + R + Q, 3]`.
-      exists: `[K + 1 + R + Q]` bool.
+      shape: `Blocks` `[N]`.
+      circle: `[N, 3]`.
+      exists: `[N]` bool.
     """
 
     shape: Blocks
@@ -89,10 +91,10 @@ def look_ahead(agent: Agent, lanes: Lanes, lights: jax.Array, num_stops: int) ->
 
 
 def gather_obstacles(
-    agents: Agent, ego: Box, replayed: Box, present: jax.Array, facts: RoadFacts
+    agents: Agent, egos: Box, replayed: Box, present: jax.Array, facts: RoadFacts
 ) -> Obstacles:
     """Joins all obstacles into one table; the order decides among equal distances."""
-    boxes = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), ego, replayed)
+    boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), egos, replayed)
     shapes = jax.vmap(one_box)(boxes)
     room = agents.shape.x.shape[1]
 
@@ -109,7 +111,7 @@ def gather_obstacles(
         shape=jax.tree.map(join, agents.shape, shapes, facts.stops),
         circle=jnp.concatenate([agents.circle, jax.vmap(shape_circle)(shapes), facts.stop_circle]),
         exists=jnp.concatenate(
-            [agents.active, jnp.ones(1, bool), present, facts.stop_circle[:, 2] >= 0]
+            [agents.active, jnp.ones(egos.x.shape, bool), present, facts.stop_circle[:, 2] >= 0]
         ),
     )
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from spdm_jax import planner
+from spdm_jax.agents.forecast import React
 from spdm_jax.config import DT, NUM_TRAJECTORY_STATES, PlannerConfig, PlannerParams
 from spdm_jax.planner import StepInput
 from spdm_jax.simulation.controller import Plan
@@ -34,11 +35,14 @@ class Driver(NamedTuple):
       name: for tables.
       init: from the scenario to the state before the first step.
       step: from scenario, input, time (s) and state to `Driven`.
+      step_reacting: the same with how traffic would react besides (last); used instead of `step`
+        in reactive traffic where it is given.
     """
 
     name: str
     init: Callable[[Scenario], Any]
     step: Callable[[Scenario, StepInput, jax.Array, Any], Driven]
+    step_reacting: Callable[[Scenario, StepInput, jax.Array, Any, React], Driven] | None = None
 
 
 def _regular(values: dict[str, jax.Array], time: jax.Array) -> Plan:
@@ -52,13 +56,13 @@ def planner_driver(name: str, params: PlannerParams, config: PlannerConfig) -> D
     def init(scene):
         return planner.init(scene, params, config)
 
-    def step(scene, given, time, state):
-        result, state = planner.step(scene, given, state, params, config)
+    def step(scene, given, time, state, react=None):
+        result, state = planner.step(scene, given, state, params, config, react)
         chosen = result.trajectory
         values = {"x": chosen.x, "y": chosen.y, "heading": chosen.heading}
         return Driven(_regular(values, time), state, result.overflow)
 
-    return Driver(name, init, step)
+    return Driver(name, init, step, step if config.forecast == "reactive" else None)
 
 
 def constant_velocity_driver() -> Driver:

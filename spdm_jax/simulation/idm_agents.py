@@ -29,15 +29,21 @@ from spdm_jax.simulation.agent_state import (
     replayed_boxes,
 )
 from spdm_jax.simulation.history import Snapshot
+from spdm_jax.simulation.script import Script, ego_reach, heeds_reach
 from spdm_jax.types import Lanes, LightStatus, ScenarioMap
 
 _IDM_EXPONENT = 4
 
 
 def _extend(
-    agent: Agent, lanes: Lanes, facts: RoadFacts, lights: jax.Array, params: AgentParams
+    agent: Agent,
+    drives: jax.Array,
+    lanes: Lanes,
+    facts: RoadFacts,
+    lights: jax.Array,
+    params: AgentParams,
 ) -> Agent:
-    """Appends lanes while the path ahead is short.
+    """Appends lanes to the path of an agent that drives while the path ahead is short.
 
     Source: nuPlan `IDMAgent.plan_route`.
     """
@@ -54,7 +60,7 @@ def _extend(
         agent, lane = state
         ahead = path_end(agent.path) - agent.progress
         wanted = params.min_path_length + agent.target_speed * params.headway_time
-        return agent.active & (lane >= 0) & (ahead < wanted)
+        return drives & (lane >= 0) & (ahead < wanted)
 
     def append(state):
         agent, lane = state
@@ -118,6 +124,8 @@ def step_traffic(
     dt: jax.Array,
     params: AgentParams,
     sizes: AgentSizes,
+    script: Script | None = None,
+    iteration: jax.Array | None = None,
 ) -> Traffic:
     """Moves all reactive agents from iteration i to i + 1.
 
@@ -133,6 +141,8 @@ def step_traffic(
       dt: s between the two.
       params: nuPlan's settings.
       sizes: static room.
+      script: of an interPlan scenario.
+      iteration: `[]` int32, i; needed with a script.
 
     Source: nuPlan `IDMAgentManager.propagate_agents`. Where nuPlan aborts because an agent's
     corridor misses the agent itself, the agent stays where it is for this step.
@@ -142,8 +152,22 @@ def step_traffic(
     num = agents.active.shape[0]
     near = jnp.hypot(agents.x - ego_box.x, agents.y - ego_box.y) <= params.radius
     agents = agents.replace(active=agents.active & near)
+    drives, heeds = agents.active, None
+    ego_speeds = jnp.broadcast_to(ego_speed, (num,))
+    egos = jax.tree.map(lambda v: v[None], ego_box)
+    if script is not None:
+        assert iteration is not None
+        row = jnp.maximum(agents.track, 0)
+        drives &= ~script.stopped[row]
+        ego_speeds = jnp.where(script.cautious[row], 0, ego_speeds)
+        reach = ego_reach(ego_box, ego_speed)
+        egos = jax.tree.map(lambda a, b: jnp.stack([a, b]), ego_box, reach)
+        heeds = heeds_reach(script, agents, scene_map, ego_box, reach, iteration)
+    num_egos = egos.x.shape[0]
     # Routes and corridors depend on nobody else: all at once.
-    agents = jax.vmap(lambda agent: _extend(agent, lanes, facts, lights, params))(agents)
+    agents = jax.vmap(lambda agent, drives: _extend(agent, drives, lanes, facts, lights, params))(
+        agents, drives
+    )
     num_stops = facts.stop_edges.shape[0]
     outlooks = jax.vmap(lambda agent: look_ahead(agent, lanes, lights, num_stops))(agents)
     ends = jax.vmap(path_end)(agents.path)
@@ -152,8 +176,9 @@ def step_traffic(
 
     def advance(i, lead: Lead, now: _Motion):
         k = jnp.clip(lead.obstacle, 0, num - 1)
-        is_agent, is_ego = (lead.obstacle >= 0) & (lead.obstacle < num), lead.obstacle == num
-        lead_speed = jnp.where(is_agent, now.speed[k], jnp.where(is_ego, ego_speed, 0))
+        is_agent = (lead.obstacle >= 0) & (lead.obstacle < num)
+        is_ego = (lead.obstacle >= num) & (lead.obstacle < num + num_egos)
+        lead_speed = jnp.where(is_agent, now.speed[k], jnp.where(is_ego, ego_speeds[i], 0))
         direction = jnp.where(is_agent, now.heading[k], ego_heading)
         lead_speed = lead_speed * jnp.cos(wrap(direction - outlooks.heading[i]))
         # Where nothing is ahead, the end of the path is a wall.
@@ -187,7 +212,11 @@ def step_traffic(
 
         def move():
             half_width = 0.5 * agents.width[i]
-            lead = find_lead(i, half_width, now.moved[i], outlook, obstacles, facts)
+            visible = obstacles
+            if heeds is not None:
+                exists = obstacles.exists.at[num + 1].set(heeds[i])
+                visible = obstacles._replace(exists=exists)
+            lead = find_lead(i, half_width, now.moved[i], outlook, visible, facts)
             progress, speed, place = advance(i, lead, now)
             goes = (progress, speed, tuple(place))
             return jax.tree.map(
@@ -195,7 +224,7 @@ def step_traffic(
             ), lead.sees_itself
 
         (progress, speed, place), went = jax.lax.cond(
-            agents.active[i], move, lambda: (stays, jnp.bool_(False))
+            drives[i], move, lambda: (stays, jnp.bool_(False))
         )
         x, y, heading, shape, circle = place
         put = lambda values, new: values.at[i].set(new)
@@ -211,7 +240,7 @@ def step_traffic(
                 circle=put(obstacles.circle, circle),
             ),
             moved=put(now.moved, now.moved[i] | went),
-            skipped=put(now.skipped, now.skipped[i] | (agents.active[i] & ~went)),
+            skipped=put(now.skipped, now.skipped[i] | (drives[i] & ~went)),
         )
 
     start = _Motion(
@@ -221,7 +250,7 @@ def step_traffic(
         x=agents.x,
         y=agents.y,
         heading=agents.heading,
-        obstacles=gather_obstacles(agents, ego_box, replayed, present, facts),
+        obstacles=gather_obstacles(agents, egos, replayed, present, facts),
         moved=agents.moved,
         skipped=agents.skipped,
     )

@@ -4,12 +4,14 @@ Everything here is one scenario; batches are `jax.vmap` or `jax.lax.map` of `sim
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from spdm_jax.agents.forecast import ForecastPoses
 from spdm_jax.agents.observation import Observation
 from spdm_jax.config import TrackerParams, VehicleParams
 from spdm_jax.geometry import ego_box
@@ -27,6 +29,8 @@ from spdm_jax.simulation.drivers import Driver
 from spdm_jax.simulation.history import History, Snapshot
 from spdm_jax.simulation.idm_agents import step_traffic
 from spdm_jax.simulation.placement import place_agents
+from spdm_jax.simulation.reactions import Future, reactions, steps_ahead
+from spdm_jax.simulation.script import Script, Walkers, past_goal, walkers_at, with_walkers
 from spdm_jax.types import Array, EgoState, Scenario
 
 TrafficMode = Literal["replay", "reactive"]
@@ -105,6 +109,8 @@ class _Carry(NamedTuple):
     plan: Plan
     failed: jax.Array
     overflow: jax.Array
+    arrived: jax.Array
+    walkers: Walkers | None
 
 
 class _Sample(NamedTuple):
@@ -168,6 +174,7 @@ def simulate(
     params: SimulationParams,
     config: SimulationConfig,
     facts: RoadFacts | None = None,
+    script: Script | None = None,
 ) -> Run:
     """Runs one scenario from its iteration 0 to its end.
 
@@ -180,6 +187,8 @@ def simulate(
       params: traced settings.
       config: static settings.
       facts: `road_facts` of the map where several runs share it.
+      script: of an interPlan scenario, `origin` and dtype as the scene's. Its pedestrians see the
+        ego where it was, as agents do; past its goal the run ends without another sample.
 
     Source: nuPlan `Simulation`, `SimulationRunner`, `IDMAgents`, `LogPlaybackController`.
     """
@@ -203,8 +212,19 @@ def simulate(
         seconds = config.plan_seconds
         return track_step(ego, plan, time, after, params.vehicle, params.tracker, seconds)
 
-    def move_traffic(traffic, ego, at, following):
+    def objects_at(at, walkers):
+        objects = logged_objects(scene, at)
+        return objects if script is None else with_walkers(objects, script, walkers)
+
+    def walk(began, ego, i):
+        assert script is not None
+        box = ego_box(ego, params.vehicle)
+        at = jnp.asarray(i, jnp.int32)
+        return walkers_at(script, began, scene.map, box.x, box.y, at, scene.num_iterations)
+
+    def move_traffic(traffic, ego, objects, i):
         assert facts is not None
+        at, following = at_step(i), at_step(i + 1)
         return step_traffic(
             traffic,
             scene.map,
@@ -212,25 +232,43 @@ def simulate(
             ego_box(ego, params.vehicle),
             ego.heading,
             jnp.hypot(ego.vx, ego.vy),
-            logged_objects(scene, following),
+            objects,
             scene.lights[following],
             (scene.time[following] - scene.time[at]).astype(dtype),
             params.agents,
             config.sizes,
+            script,
+            i,
         )
 
-    def seen(traffic, at):
-        objects = logged_objects(scene, at)
+    def react_to(traffic, walkers, i, states: EgoState) -> ForecastPoses:
+        assert facts is not None
+        ahead = jnp.arange(steps_ahead(states.x.shape[1]) + 1)
+        recorded = jax.vmap(lambda k: objects_at(at_step(i + k), walkers))(ahead)
+        future = Future(
+            objects=recorded.replace(type=scene.tracks.type),
+            lights=scene.lights[at_step(i + ahead)],
+        )
+        vehicle, agents, sizes = params.vehicle, params.agents, config.sizes
+        return reactions(
+            states, traffic, scene.map, facts, future, i, vehicle, agents, sizes, script
+        )
+
+    def seen(traffic, at, walkers):
+        objects = objects_at(at, walkers)
         return traffic_snapshot(traffic, objects) if reactive else objects
 
     def step(carry: _Carry, i):
         at, following = at_step(i), at_step(i + 1)
-        objects, lights = seen(carry.traffic, at), scene.lights[at]
+        objects, lights = seen(carry.traffic, at, carry.walkers), scene.lights[at]
         given = _given(carry.ego, objects, lights, at)
         time = scene.time[at].astype(dtype)
 
         def think():
-            return driver.step(scene, given, time, carry.state)
+            if not reactive or driver.step_reacting is None:
+                return driver.step(scene, given, time, carry.state)
+            react = partial(react_to, carry.traffic, carry.walkers, i)
+            return driver.step_reacting(scene, given, time, carry.state, react)
 
         if config.replan_every == 1:
             plan, state, overflow = think()
@@ -240,7 +278,11 @@ def simulate(
                 lambda: tuple(think()),
                 lambda: (carry.plan, carry.state, jnp.bool_(False)),
             )
-        running = i < scene.num_iterations - 1
+        arrived = carry.arrived
+        if script is not None:
+            box = ego_box(carry.ego, params.vehicle)
+            arrived |= past_goal(script, box.x, box.y)
+        running = (i < scene.num_iterations - 1) & ~arrived
         failed = carry.failed | (running & ~_finite(plan))
         record = _Sample(
             ego=carry.ego,
@@ -251,30 +293,36 @@ def simulate(
             plan=plan if config.record_plans else None,
         )
 
-        goes_on = (i + 1 < scene.num_iterations - 1) & ~failed
+        goes_on = (i + 1 < scene.num_iterations - 1) & ~failed & ~arrived
         ego = _choose(goes_on, control(carry.ego, plan, at, following), carry.ego)
-        traffic = carry.traffic
+        traffic, walkers = carry.traffic, carry.walkers
+        if walkers is not None:
+            walkers = _choose(goes_on, walk(walkers.began, carry.ego, i + 1), walkers)
         if reactive:
+            objects = objects_at(following, walkers)
             traffic = jax.lax.cond(
                 goes_on,
-                lambda: move_traffic(carry.traffic, carry.ego, at, following),
+                lambda: move_traffic(carry.traffic, carry.ego, objects, i),
                 lambda: carry.traffic,
             )
         overflow = carry.overflow | (running & overflow)
-        return _Carry(ego, traffic, state, plan, failed, overflow), record
+        return _Carry(ego, traffic, state, plan, failed, overflow, arrived, walkers), record
 
-    traffic = None
+    traffic = walkers = None
+    if script is not None:
+        walkers = walk(jnp.full(script.track.shape, -1, jnp.int32), ego, jnp.int32(0))
+    objects = objects_at(begin, walkers)
     if reactive:
         assert facts is not None
-        objects = logged_objects(scene, begin)
         traffic = place_agents(
-            scene.map, facts, objects, ego, params.vehicle, params.agents, config.sizes
+            scene.map, facts, objects, ego, params.vehicle, params.agents, config.sizes, script
         )
     state = driver.init(scene)
-    first = _given(ego, logged_objects(scene, begin), scene.lights[begin], begin)
+    first = _given(ego, objects, scene.lights[begin], begin)
     shape = jax.eval_shape(driver.step, scene, first, scene.time[begin].astype(dtype), state)
     plan = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape.plan)
-    start = _Carry(ego, traffic, state, plan, jnp.bool_(False), jnp.bool_(False))
+    no = jnp.bool_(False)
+    start = _Carry(ego, traffic, state, plan, no, no, no, walkers)
     end, record = jax.lax.scan(step, start, jnp.arange(config.num_samples))
     skipped, overflow = jnp.int32(0), end.overflow
     if end.traffic is not None:

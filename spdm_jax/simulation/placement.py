@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from spdm_jax.arrays import true_indices
 from spdm_jax.config import VehicleParams
 from spdm_jax.geometry import Box, boxes_overlap, ego_box, point_segment_sq
-from spdm_jax.scoring.areas import containing_polygons
+from spdm_jax.scoring.areas import areas_at
 from spdm_jax.simulation.agent_paths import append_lane, empty_path, path_end, path_pose
 from spdm_jax.simulation.agent_state import (
     ROUTE_MEMORY,
@@ -20,6 +20,7 @@ from spdm_jax.simulation.agent_state import (
     replayed_boxes,
 )
 from spdm_jax.simulation.history import Snapshot
+from spdm_jax.simulation.script import Script
 from spdm_jax.simulation.shapes import shape_circle, vehicle_shape
 from spdm_jax.types import EgoState, ObjectType, Polylines, ScenarioMap
 
@@ -77,18 +78,17 @@ def _on_line(lines: Polylines, lane: jax.Array, x: jax.Array, y: jax.Array, size
 
 def _segment_of(
     inside: jax.Array,
+    crossing: jax.Array,
     scene_map: ScenarioMap,
     x: jax.Array,
     y: jax.Array,
     heading: jax.Array,
     size: int,
 ) -> _Segment:
-    """Lane of one vehicle; `inside` `[D]` tells which of the grid's polygons hold its centre."""
+    """Lane of one vehicle whose centre lies in the lanes `inside` `[L]`, or in a crossing."""
     lanes = scene_map.lanes
-    num = lanes.valid.shape[0]
-    crossing = jnp.any(inside[num + scene_map.car_parks.start.shape[0] :])
-    on_lane = inside[:num] & lanes.valid & ~lanes.is_connector
-    on_connector = inside[:num] & lanes.valid & lanes.is_connector & crossing
+    on_lane = inside & ~lanes.is_connector
+    on_connector = inside & lanes.is_connector & crossing
     candidate, real = true_indices(jnp.where(jnp.any(on_lane), on_lane, on_connector), _CANDIDATES)
     found = jax.vmap(lambda lane: _on_line(lanes.centerline, lane, x, y, size))(candidate)
     # As published, the difference of headings is not wrapped.
@@ -105,6 +105,7 @@ def place_agents(
     vehicle: VehicleParams,
     params: AgentParams,
     sizes: AgentSizes,
+    script: Script | None = None,
 ) -> Traffic:
     """Turns the vehicles of iteration 0 into agents on their baselines.
 
@@ -120,25 +121,30 @@ def place_agents(
       vehicle: ego dimensions.
       params: nuPlan's settings.
       sizes: static room.
+      script: of an interPlan scenario; its stopped vehicles stay where they are, whatever they
+        touch and on no lane as well.
 
     Source: nuPlan `build_idm_agents_on_map_rails`.
     """
     num = objects.type.shape[0]
-    words = containing_polygons(scene_map.grid, objects.x, objects.y)
-    bits = jnp.stack([(w[:, None] >> jnp.arange(32, dtype=jnp.uint32)) & 1 for w in words], 1)
-    polygons = (
-        scene_map.lanes.valid.shape[0]
-        + scene_map.car_parks.start.shape[0]
-        + scene_map.intersections.start.shape[0]
-    )
-    inside = bits.reshape(num, -1)[:, :polygons] > 0
+    areas = areas_at(scene_map, objects.x, objects.y)
     segment = jax.lax.map(
         lambda given: _segment_of(
-            given[0], scene_map, given[1], given[2], given[3], sizes.path_points
+            given[0], given[1], scene_map, given[2], given[3], given[4], sizes.path_points
         ),
-        (inside, objects.x, objects.y, objects.heading),
+        (areas.lanes, areas.intersection, objects.x, objects.y, objects.heading),
     )
-    wanted = objects.valid & (objects.type == ObjectType.VEHICLE) & (segment.lane >= 0)
+    wanted = objects.valid & (objects.type == ObjectType.VEHICLE)
+    stays = jnp.zeros(num, bool)
+    if script is not None:
+        stays = wanted & script.stopped
+        keep = lambda own, snapped: jnp.where(stays, own, snapped)
+        segment = segment._replace(
+            x=keep(objects.x, segment.x),
+            y=keep(objects.y, segment.y),
+            heading=keep(objects.heading, segment.heading),
+        )
+    wanted &= stays | (segment.lane >= 0)
     box = Box(
         segment.x,
         segment.y,
@@ -149,14 +155,14 @@ def place_agents(
     )
     fixed, present, overflow = replayed_boxes(objects, sizes.replayed)
     own = ego_box(ego, vehicle)
-    limit = scene_map.lanes.speed_limit[segment.lane]
+    limit = jnp.where(segment.lane >= 0, scene_map.lanes.speed_limit[segment.lane], jnp.nan)
 
     def decide(carry, row):
         accepted, target = carry
         here = jax.tree.map(lambda v: v[row], box)
         blocked = jnp.any(present & boxes_overlap(fixed, here))
         blocked |= boxes_overlap(own, here) | jnp.any(accepted & boxes_overlap(box, here))
-        takes = wanted[row] & ~blocked
+        takes = wanted[row] & (stays[row] | ~blocked)
         target = jnp.where(takes & (limit[row] > 0), limit[row], target)
         return (accepted.at[row].set(takes), target), target
 
@@ -174,6 +180,8 @@ def place_agents(
         start = empty_path(sizes.path_points, objects.x.dtype)
         path, too_long = append_lane(start, jnp.zeros_like(objects.x[0]), scene_map.lanes, lane)
         x, y, heading = path_pose(path, jnp.clip(segment.progress[row], 0, path_end(path)))
+        own = objects.x[row], objects.y[row], objects.heading[row]
+        x, y, heading = jax.tree.map(lambda a, b: jnp.where(stays[row], a, b), own, (x, y, heading))
         body = jax.tree.map(lambda v: v[row], box)
         # Until it has moved, its footprint is its box.
         point = lambda v: jnp.broadcast_to(v, (sizes.footprint_points,))

@@ -1,6 +1,5 @@
 """Plays a named scene and hands it over as a `RawScenario`, alone or through a `Reader`."""
 
-import functools
 import inspect
 import zlib
 from collections.abc import Callable, Sequence
@@ -78,12 +77,10 @@ def play(name: str, seed: int, scene: Callable[[np.random.Generator], Stage]) ->
       scene: makes the stage.
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    return play(
-        functools.partial(SCENES[name], **options), rng, token=f"{name}-{seed}", scenario_type=name
-    )
+    return record(scene, rng, token=f"{name}-{seed}", scenario_type=name)
 
 
-def play(
+def record(
     scene: Callable[[np.random.Generator], Stage],
     rng: np.random.Generator,
     *,

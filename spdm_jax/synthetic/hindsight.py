@@ -5,6 +5,8 @@ a run repeat the record only roughly. Collisions and the drivable area are check
 the record, everything else within the scenario's own window.
 """
 
+import itertools
+
 import numpy as np
 import shapely
 
@@ -17,8 +19,9 @@ LAT_ACCEL = 4.0  # m/s^2
 LON_JERK = 3.8  # m/s^3
 YAW_RATE = 0.85  # rad/s
 YAW_ACCEL = 1.7  # rad/s^2
-TTC_STEPS = 12  # steps of constant velocity, the bound is 0.95 s
-TTC_ANGLE = np.radians(30.0)  # of what counts as ahead
+TTC_STEPS = 11  # steps of constant velocity, the bound is 0.95 s
+TTC_TURNS = (-0.025, 0.0, 0.025)  # rad, deviations of the heading of whoever repeats the record
+TTC_ANGLE = np.radians(150.0)  # from the ego's heading, objects beyond it are behind
 NEAR = 40.0  # m, objects further away are not met within `TTC_STEPS`
 
 
@@ -115,25 +118,29 @@ def _near(raw: RawScenario, steps: slice) -> np.ndarray:
 
 
 def _close_call(raw: RawScenario, window: slice) -> int | None:
-    """Returns the first step at which the ego would soon hit something ahead of it."""
+    """Returns the first step at which the ego would soon hit something that is not behind it.
+
+    nuPlan looks beside the ego only while it is between lanes; here it is always looked there.
+    """
     pairs = _near(raw, window)
     track, step = pairs[:, 0], pairs[:, 1]
     ego = raw.ego[window][step]
     pose, velocity = raw.tracks.pose[:, window][track, step], raw.tracks.velocity[:, window]
     offset = pose[:, :2] - ego[:, :2]
     turn = np.arctan2(offset[:, 1], offset[:, 0]) - ego[:, 2]
-    ahead = (np.cos(turn) > np.cos(TTC_ANGLE)) & (ego[:, 3] > 0.005)
-    track, step, ego, pose = track[ahead], step[ahead], ego[ahead], pose[ahead]
+    kept = (np.cos(turn) > np.cos(TTC_ANGLE)) & (ego[:, 3] > 0.005)
+    track, step, ego, pose = track[kept], step[kept], ego[kept], pose[kept]
     speed = np.linalg.norm(velocity[track, step], axis=-1)
     size = raw.tracks.size[:, window][track, step]
-    for k in range(1, TTC_STEPS + 1):
+    first = np.inf
+    for k, deviation in itertools.product(range(1, TTC_STEPS + 1), TTC_TURNS):
         then, there = ego[:, :3].copy(), pose.copy()
-        then[:, :2] += k * DT * ego[:, 3:4] * _direction(ego[:, 2])
+        then[:, 2] += deviation
+        then[:, :2] += k * DT * ego[:, 3:4] * _direction(then[:, 2])
         there[:, :2] += k * DT * speed[:, None] * _direction(pose[:, 2])
         hit = shapely.intersects(ego_boxes(then), boxes(there, size))
-        if hit.any():
-            return int(step[hit].min())
-    return None
+        first = min(first, step[hit].min(initial=len(raw.ego)))
+    return int(first) if first < len(raw.ego) else None
 
 
 def _direction(heading: np.ndarray) -> np.ndarray:

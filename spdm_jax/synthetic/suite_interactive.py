@@ -11,9 +11,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from spdm_jax.io.raw import RawArea
 from spdm_jax.synthetic.filling import fill_oncoming, roadside, start_on
 from spdm_jax.synthetic.paths import Path
-from spdm_jax.synthetic.roads import LANE_WIDTH, MARGIN, MapBuilder, add_corridor
+from spdm_jax.synthetic.roads import LANE_WIDTH, MARGIN, MapBuilder, add_corridor, strip
 from spdm_jax.synthetic.stage import (
     BARRIER,
     CONE,
@@ -29,7 +30,7 @@ from spdm_jax.synthetic.stage import (
 )
 from spdm_jax.synthetic.suite_stage import EXPERT_PACE, LONG_AGO, expert, tail
 from spdm_jax.synthetic.traffic import EGO_FRONT
-from spdm_jax.types import LightStatus, ObjectType
+from spdm_jax.types import DrivableKind, LightStatus, ObjectType
 
 HOLD = "expert.hold"
 """A line at which the expert waits until the way is free; no planner sees it."""
@@ -40,7 +41,7 @@ FRONT = EGO_STATION + EGO_FRONT
 
 
 def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: float) -> Stage:
-    """The ego's lane ends; the goal is on the lane beside it.
+    """The ego's lane of a one-way road ends; the goal is on the lane beside it.
 
     Args:
       rng: source of variety.
@@ -49,7 +50,9 @@ def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: f
     """
     gap = rng.uniform(*spacing)
     speed = rng.uniform(0.62, 0.72) * limit
-    end = FRONT + rng.uniform(105.0, 135.0)
+    begin = EGO_STATION + rng.uniform(4.0, 12.0)
+    done = begin + 4.5 * speed
+    end = done + EGO_FRONT + rng.uniform(5.0, 20.0)
     goal = int(rng.integers(2))
     path = Path.from_curvature([(end, rng.uniform(-1.0, 1.0) / 400.0), (500.0, 0.0)])
     builder = MapBuilder("synthetic")
@@ -59,7 +62,6 @@ def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: f
         path,
         [(0.0, end), (end + 6.0, end + 200.0), (end + 206.0, path.length)],
         forward=[(0, 1), (goal,), (goal,)],
-        backward=1 if goal == 0 else 0,
         speed_limit=limit,
         connector_limit=limit,
     )
@@ -67,8 +69,7 @@ def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: f
     lane = stage.ego.path
     sideways = LANE_WIDTH if goal == 0 else -LANE_WIDTH
     own = lane.parallel(-sideways)
-    begin = EGO_STATION + rng.uniform(5.0, 20.0)
-    change = own.shifted(begin, begin + 5.5 * speed, sideways)
+    change = own.shifted(begin, done, sideways)
     # The ego is about in the middle of a gap; all want the same speed, so the gap stays with it.
     first = EGO_STATION + EGO_FRONT / 2 + rng.uniform(0.45, 0.55) * gap
     for k in range(-3, 9):
@@ -79,30 +80,33 @@ def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: f
     stage.ego = dataclasses.replace(stage.ego, path=own)
     tail(rng, stage, rng.uniform(14.0, 25.0))
     stage.ego = expert(stage.ego, change)
-    for left in (-0.9, 0.9):
-        stage.scripted.append(standing(own, end + 1.5, left, BARRIER, ObjectType.BARRIER))
-    if goal == 0:
-        fill_oncoming(rng, stage, 1, 45.0, speed)
+    # The surface goes on a little, so that who stops at the end stands on it.
+    middle = -(1.5 - goal) * LANE_WIDTH
+    reach = LANE_WIDTH / 2 + MARGIN
+    rest = strip(path, end - 1.0, end + 12.0, middle - reach, middle + reach)
+    builder.drivable.append(RawArea("road.end", rest, DrivableKind.GENERIC))
+    for left in (middle - 0.9, middle + 0.9):
+        stage.scripted.append(standing(path, end + 8.0, left, BARRIER, ObjectType.BARRIER))
     return stage
 
 
 def construction_zone(rng: np.random.Generator) -> Stage:
     """Cones and barriers close the ego's lane of two; the expert passes them on the other one."""
     stage, path, speed = _two_lanes(rng)
-    begin, length = FRONT + rng.uniform(38.0, 60.0), rng.uniform(18.0, 30.0)
+    begin, length = FRONT + rng.uniform(56.0, 72.0), rng.uniform(18.0, 28.0)
     own = stage.ego.path
     edge = LANE_WIDTH / 2
-    for k, left in enumerate(np.linspace(-edge + 0.2, edge - 0.5, 6)):
+    for k, left in enumerate(np.linspace(-edge + 0.2, edge - 0.8, 6)):
         stage.scripted.append(standing(own, begin + 2.0 * k, left, CONE, ObjectType.TRAFFIC_CONE))
     for station in np.arange(begin + 14.0, begin + 10.0 + length, 3.0):
-        cone = standing(own, station, edge - 0.4, CONE, ObjectType.TRAFFIC_CONE)
+        cone = standing(own, station, edge - 0.7, CONE, ObjectType.TRAFFIC_CONE)
         stage.scripted.append(cone)
     for station in (begin + 12.0, begin + 10.0 + length):
         barrier = standing(own, station, -0.3, BARRIER, ObjectType.BARRIER)
         stage.scripted.append(barrier)
     sign = standing(own, begin - 8.0, -edge - 0.2, SIGN, ObjectType.CZONE_SIGN)
     stage.scripted.append(sign)
-    _pass_left(rng, stage, speed, begin - 3.0, begin + 14.0 + length, LANE_WIDTH)
+    _pass_left(rng, stage, speed, begin - 12.0, begin + 14.0 + length, LANE_WIDTH)
     _beside(rng, stage, path, speed)
     return stage
 
@@ -110,11 +114,11 @@ def construction_zone(rng: np.random.Generator) -> Stage:
 def crashed_cars(rng: np.random.Generator) -> Stage:
     """Two cars have crashed on the ego's lane of two; the other one is free."""
     stage, path, speed = _two_lanes(rng)
-    begin = FRONT + rng.uniform(46.0, 62.0)
+    begin = FRONT + rng.uniform(58.0, 74.0)
     own = stage.ego.path
     for station, turn in ((begin + 2.5, rng.uniform(0.3, 0.7)), (begin + 7.5, -0.4)):
         size = (rng.uniform(4.2, 4.8), 1.85)
-        car = standing(own, station, -0.55, size, ObjectType.GENERIC_OBJECT)
+        car = standing(own, station, -0.8, size, ObjectType.GENERIC_OBJECT)
         x, y, heading = car.start
         heading += float(turn * rng.choice([-1.0, 1.0]))
         stage.scripted.append(dataclasses.replace(car, start=(x, y, heading)))
@@ -224,7 +228,7 @@ INTERACTIVE: dict[str, Callable[[np.random.Generator], Stage]] = {
 
 def _two_lanes(rng: np.random.Generator) -> tuple[Stage, Path, float]:
     """Returns a road with two lanes, the ego on the right one; its reference line and speed."""
-    speed, limit = rng.uniform(8.0, 10.0), 13.4
+    speed, limit = rng.uniform(7.5, 9.5), 11.1
     builder, path = corridor(rng, _winding(rng), lanes=2, oncoming=1, speed_limit=limit)
     return start_on(builder, 1, speed, EXPERT_PACE * limit), path, speed
 
@@ -250,7 +254,7 @@ def _pass_left(
       left: sideways motion, m.
     """
     done = out - EGO_FRONT
-    begin = max(done - rng.uniform(3.5, 4.5) * speed, EGO_STATION + 2.0)
+    begin = max(done - rng.uniform(5.0, 6.0) * speed, EGO_STATION + 2.0)
     around = stage.ego.path.shifted(begin, done, left)
     around = around.shifted(back, back + rng.uniform(3.5, 4.5) * speed, -left)
     stage.ego = expert(stage.ego, around)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from spdm_jax.io.raw import RawScenario, ScenarioError
-from spdm_jax.synthetic.generator import play
+from spdm_jax.synthetic.generator import record
 from spdm_jax.synthetic.hindsight import faults
 from spdm_jax.synthetic.stage import Stage
 from spdm_jax.synthetic.suite_common import COMMON
@@ -77,7 +77,7 @@ class SuiteReader:
         scenario_type, number = self._scenes[token]
         key = zlib.crc32(f"{self._suite}/{scenario_type}".encode())
         for draw in range(MAX_DRAWS):
-            raw = play(
+            raw = record(
                 SUITES[self._suite][scenario_type],
                 np.random.default_rng([draw, number, key]),
                 token=token,

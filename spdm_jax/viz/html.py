@@ -138,12 +138,9 @@ def render(
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     folder = files("spdm_jax.viz")
     page = folder.joinpath("player.html").read_text(encoding="utf-8")
-    parts = {
-        "title": html.escape(title),
-        "draw": folder.joinpath("draw.js").read_text(encoding="utf-8"),
-        "player": folder.joinpath("player.js").read_text(encoding="utf-8"),
-        "data": text,
-    }
+    read = lambda name: folder.joinpath(name).read_text(encoding="utf-8")
+    scripts = {name: read(f"{name}.js") for name in ("canvas", "draw", "player")}
+    parts = {"title": html.escape(title), "data": text, **scripts}
     # One pass, so that what is put in is not searched for marks again.
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], page)
 

@@ -3,13 +3,6 @@
 
 // ---- text beside the pictures -------------------------------------------------------------------
 
-function element(tag, text, attributes = {}) {
-  const node = document.createElement(tag);
-  if (text !== undefined) node.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-  return node;
-}
-
 function describe(plan, i) {
   const parts = [`proposal ${plan.row[i]}`];
   if (plan.stage[i] >= 0) parts.push(`stage ${plan.stage[i]}, path ${plan.path[i]}`);

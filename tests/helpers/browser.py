@@ -1,10 +1,12 @@
 """Pages as their readers meet them: as tags and scripts, and alive in headless Chromium."""
 
+import json
 import shutil
 import subprocess
 from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -76,3 +78,22 @@ def browse(
     )
     assert run.returncode == 0, run.stderr[-2000:]
     return run.stdout, [line for line in run.stderr.splitlines() if "CONSOLE" in line]
+
+
+def run_scripts(page: Path, script: str) -> Any:
+    """Runs the scripts of a page, then one more, without a browser; see `fake_page.js`.
+
+    Args:
+      page: HTML file.
+      script: body of a function, which sees the page's own names, `nodes` and `drawn`.
+
+    Returns:
+      What it returns.
+    """
+    program = shutil.which("node")
+    if program is None:
+        pytest.skip("no Node.js found")
+    command = [program, str(Path(__file__).with_name("fake_page.js")), str(page), script]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stderr[-2000:]
+    return json.loads(run.stdout)

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import jax.numpy as jnp
 
-from spdm_experiments import cli, run_folder, sweep, sweep_work
+from spdm_experiments import cli, grid_run, run_folder, sweep_work
 from spdm_experiments.sweep_scene import Poses, Reading
 from spdm_jax.results import SCORE_COLUMNS
 
@@ -61,7 +61,7 @@ def stop_at(moment: str, count: int) -> None:
             print("stopped", flush=True)
             sys.stdin.readline()
 
-    folder, local, engine = cast(Any, run_folder), cast(Any, sweep), sweep_work.Engine
+    folder, local, engine = cast(Any, run_folder), cast(Any, grid_run), sweep_work.SweepEngine
     write, load, process = folder.write_atomically, local.load_chunk, engine.process
 
     def writing(path: Path, content: bytes) -> None:

@@ -10,8 +10,9 @@ import pytest
 from small_road import road
 from spdm_jax.interplan.modification_file import modifications_from
 from spdm_jax.interplan.modify import modify
-from spdm_jax.interplan.script import POLICIES, Script, past_goal, script_of, walkers_at
+from spdm_jax.interplan.script import script_of
 from spdm_jax.io.build import build_scenario
+from spdm_jax.simulation.script import AgentPolicy, Script, past_goal, walkers_at
 
 TOKEN = "0123456789abcdef"
 SPECIAL = {
@@ -38,7 +39,7 @@ def script(dtype=jnp.float64) -> Script:
 
 def test_script():
     made = script()
-    assert POLICIES[int(made.policy)] == "cautious"
+    assert made.policy == AgentPolicy.CAUTIOUS
     ids = np.array(INFO.track_ids)
     assert ids[np.flatnonzero(made.stopped)].tolist() == list(EXTRAS.stopped)
     assert ids[np.flatnonzero(made.cautious)].tolist() == list(EXTRAS.cautious)

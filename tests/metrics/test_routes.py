@@ -9,8 +9,8 @@ import pytest
 import shapely
 
 from spdm_jax.io.flatten import index_table, polygons_of_rings
-from spdm_jax.metrics.motion import Areas
 from spdm_jax.metrics.routes import corner_lanes, driven_route, lane_changes
+from spdm_jax.scoring.areas import Areas
 from spdm_jax.types import Lanes
 
 LANES, STEPS, SEEDS = 12, 40, 48

@@ -22,7 +22,7 @@ from spdm_jax.types import DrivableKind, Scenario, ScenarioInfo, ScenarioMap
 _SIZES = PaddingConfig(
     roadblock_edges=(4096, 16384, 65536),
     grid_cells=(131072, 524288, 2097152),
-    grid_slots=(16, 64, 256),
+    grid_edges=(32768, 131072, 524288),
 )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -147,3 +148,32 @@ def test_missing_limits_take_the_agent_before():
     result = run(far_road(things=[Thing(30.0, 0.0, speed=9.9)], limit=None))
     speed = result.history.objects.vx[:, 0]
     assert np.all(speed < 10.0)
+
+
+def test_a_road_without_objects():
+    assert not run(far_road()).history.objects.valid.any()
+
+
+def test_more_agents_than_room_is_overflow():
+    things = [Thing(30.0 + 15.0 * i, 0.0, speed=5.0) for i in range(9)]
+    raw = dataclasses.replace(far_road(things=things), num_iterations=SAMPLES + 1)
+    assert _run(roads.scene_of(raw), SimulationParams()).overflow
+
+
+@pytest.mark.slow
+def test_batches_repeat_single_runs():
+    raws = [
+        far_road(things=[Thing(60.0, 0.0, speed=10.0), Thing(90.0, 0.0, speed=2.0)]),
+        far_road(things=[Thing(40.0, -3.5, speed=3.0)]),
+    ]
+    scenes = [roads.scene_of(dataclasses.replace(raw, num_iterations=SAMPLES + 1)) for raw in raws]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    batched = jax.jit(jax.vmap(_run, in_axes=(0, None)))(both, SimulationParams())
+    for i, scene in enumerate(scenes):
+        alone = _run(scene, SimulationParams()).history.objects
+        ours = jax.tree.map(lambda leaf, i=i: leaf[i], batched.history.objects)
+        np.testing.assert_array_equal(ours.valid, alone.valid)
+        for name in ("x", "y", "heading", "vx"):
+            mine = np.where(ours.valid, getattr(ours, name), 0)
+            theirs = np.where(alone.valid, getattr(alone, name), 0)
+            np.testing.assert_allclose(mine, theirs, atol=1e-9)

@@ -12,7 +12,7 @@ from spdm_jax.io.build import build_scenario
 from spdm_jax.io.raw import RawLane, RawScenario, ScenarioError
 from spdm_jax.io.validate import validate_raw
 from spdm_jax.synthetic import SUITES, SuiteReader, suite_names
-from spdm_jax.synthetic.generator import play
+from spdm_jax.synthetic.generator import record
 from spdm_jax.synthetic.hindsight import boxes, discomfort, ego_boxes, faults
 from spdm_jax.types import LightStatus, ObjectType
 
@@ -436,7 +436,7 @@ def test_faults_are_found():
     now = good.num_history
 
     def changed(change) -> list[str]:
-        raw = play(
+        raw = record(
             SUITES["common-14"]["following_lane_with_lead"],
             np.random.default_rng(0),
             token="t",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from browser import Page, browse
+from browser import Page, browse, run_scripts
 from spdm_jax import __version__
 from spdm_jax.results import PlanSet, ScenarioSet
 from spdm_jax.types import ScenarioInfo
@@ -250,3 +250,21 @@ def test_page_answers_to_pointer_and_table(tmp_path: Path, scenes: ScenarioSet, 
     assert report["step"] == plans.explain(last, failing).step == 11 and report["clock"] == "1.1 s"
     rear = [getattr(plans.tracked, n)[last, failing, 11] for n in ("x", "y", "heading")]
     np.testing.assert_allclose(report["rear"], rear, atol=0.006)
+
+
+def test_scripts_run_without_a_browser(page: str, tmp_path: Path):
+    path = tmp_path / "page.html"
+    path.write_text(page, encoding="utf-8")
+    told = run_scripts(
+        path,
+        """
+        showScene(1);
+        for (let i = 0; i <= LAST; i += 1) setStep(i);
+        hoverAt(0, 1);
+        pin(0, 2);
+        nodes.fit.fire("click");
+        return { why: nodes.why.text(), clock: nodes.clock.textContent, drawn: drawn.fill > 40 };
+        """,
+    )
+    assert "pinned" in told["why"] or "proposal" in told["why"]
+    assert told["clock"] == "4.0 s" and told["drawn"]

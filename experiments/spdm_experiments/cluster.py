@@ -1,4 +1,4 @@
-"""A sweep on a Ray cluster: one chunk is one task, and tasks share nothing.
+"""A run on a Ray cluster: one chunk is one task, and tasks share nothing.
 
 A task reads its scenarios, computes, writes its own part of the run folder and returns names and
 counts. A task whose worker is lost is run again; it writes the same part under the same name, so
@@ -10,18 +10,18 @@ import os
 import re
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from spdm_experiments.loading import Loader
-from spdm_experiments.options import Sweep
+from spdm_experiments.options import OverGrid
 from spdm_experiments.runtime import configure_jax, provenance
-from spdm_experiments.sweep_work import Chunk, Done, Engine, Job, load_chunk, loader_of
+from spdm_experiments.work import Chunk, Done, Engine, Job, load_chunk
 from spdm_jax.batching import BatchConfig
 
 RETRIES = 5
 """How often a chunk is tried again after its worker was lost."""
 _engines: dict[str, Engine] = {}
-"""In a worker: the engine of the sweep at hand, which keeps its compiled programs."""
+"""In a worker: the engine of the run at hand, which keeps its compiled programs."""
 _loaders: dict[str, Loader] = {}
 """In a worker: what reads for that engine."""
 
@@ -32,7 +32,7 @@ class Cluster:
     serial = False
     """One worker computes while another compiles."""
 
-    def __init__(self, options: Sweep):
+    def __init__(self, options: OverGrid):
         """Connects to the cluster that the options name, or starts one.
 
         Raises:
@@ -49,7 +49,7 @@ class Cluster:
         self._options = options
         if not ray.is_initialized():
             _connect(ray, str(options.cluster))
-        self.kind = "gpu" if options.device == "gpu" else "cpu"
+        self.kind: Literal["cpu", "gpu"] = "gpu" if options.device == "gpu" else "cpu"
         needs: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES}
         if self.kind == "gpu":
             needs["num_gpus"] = 1
@@ -115,32 +115,32 @@ def _connect(ray: Any, address: str) -> None:
         ) from error
 
 
-def run_chunk(key: str, options: Sweep, job: Job, chunk: Chunk) -> Done:
+def run_chunk(key: str, options: OverGrid, job: Job, chunk: Chunk) -> Done:
     """Computes a chunk in a worker.
 
     Args:
-      key: of this sweep, so that the worker keeps its programs from one chunk to the next.
+      key: of this run, so that the worker keeps its programs from one chunk to the next.
       options: device and compile cache.
-      job: of the sweep.
+      job: of the run.
       chunk: scenarios.
     """
     if key not in _engines:
         _prepare(options)
         _engines.clear()
         threads = BatchConfig(devices=1, threads=1)
-        _engines[key] = Engine(dataclasses.replace(job, batching=threads))
+        _engines[key] = dataclasses.replace(job, batching=threads).engine()
         _loaders.clear()
-        _loaders[key] = loader_of(job)
+        _loaders[key] = job.loader()
     return _engines[key].process(load_chunk(chunk, job, _loaders[key]))
 
 
-def about(options: Sweep) -> dict[str, object]:
+def about(options: OverGrid) -> dict[str, object]:
     """Returns versions, commit and device of a worker."""
     _prepare(options)
     return provenance()
 
 
-def _prepare(options: Sweep) -> None:
+def _prepare(options: OverGrid) -> None:
     # A worker has one core; JAX would start a thread for each of the machine's. It reads this
     # when it first computes, not when it is imported.
     os.environ["NPROC"] = "1"

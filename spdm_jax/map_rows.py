@@ -36,7 +36,7 @@ def _walk(
         real = place < count[..., None]
         return visit(jnp.clip(start[..., None] + place, 0, size - 1), real, carry)
 
-    return jax.lax.fori_loop(0, (jnp.max(count) + _BLOCK - 1) // _BLOCK, block, carry)
+    return jax.lax.fori_loop(0, (jnp.max(count, initial=0) + _BLOCK - 1) // _BLOCK, block, carry)
 
 
 def polygon_contains(polygons: Polygons, row: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:

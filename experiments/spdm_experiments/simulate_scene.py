@@ -1,0 +1,172 @@
+"""What a simulation computes in one scene, as a pure function: drive, judge, keep what rows need.
+
+The file is apart from the rest because a stored program is found by the source that it was made
+from.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from spdm_jax.config import PlannerConfig, PlannerParams
+from spdm_jax.decision import cast_params
+from spdm_jax.metrics import (
+    ClosedLoopMetrics,
+    Expert,
+    ExpertPoses,
+    OpenLoopMetrics,
+    closed_loop,
+    comparison_indices,
+    open_loop,
+)
+from spdm_jax.metrics.routes import CornerLanes
+from spdm_jax.simulation.controller import Plan, pose_at
+from spdm_jax.simulation.drivers import (
+    Driver,
+    constant_velocity_driver,
+    log_replay_driver,
+    planner_driver,
+)
+from spdm_jax.simulation.history import History
+from spdm_jax.simulation.idm_driver import idm_driver
+from spdm_jax.simulation.loop import SimulationConfig, SimulationParams, simulate
+from spdm_jax.types import Array, Scenario
+
+UNREAD = ("map.crosswalks", "map.walkways")
+"""Layers that neither planners nor agents nor metrics read."""
+SHOWN_SECONDS = np.arange(17) * 0.5
+"""Times of a plan's recorded poses, s after its start."""
+
+
+@dataclass(frozen=True)
+class Switches:
+    """What a new value of compiles anew.
+
+    Attributes:
+      planner: name on the command line.
+      config: of the planner; of the others but PDM-Closed and SPDM only `max_path_points` counts.
+      simulation: of the loop; its `ego` is "log" in open loop.
+      num_iterations: N of every scenario.
+      record: also return the run.
+    """
+
+    planner: str
+    config: PlannerConfig
+    simulation: SimulationConfig
+    num_iterations: int
+    record: bool = False
+
+
+class Kept(struct.PyTreeNode, kw_only=True):
+    """A run as it is written, T samples.
+
+    Attributes:
+      history: of the run.
+      plans: `[T, 17, 3]` x, y, heading every 0.5 s, local frame, or None.
+    """
+
+    history: History
+    plans: Array | None
+
+
+class Result(struct.PyTreeNode, kw_only=True):
+    """One finished run.
+
+    Attributes:
+      metrics: closed-loop or open-loop metrics; the routes are left out.
+      time: `[T]` s of the samples.
+      samples: `[]` int32, how many of them are real.
+      failed: `[]` bool, the planner returned a number that is not finite.
+      overflow: `[]` bool, a fixed buffer was too small.
+      short: `[]` bool, the record ends before the last plan of an open-loop run does.
+      skipped_agents: `[]` int32, reactive agents that once could not move.
+      kept: the run, or None.
+    """
+
+    metrics: ClosedLoopMetrics | OpenLoopMetrics
+    time: Array
+    samples: Array
+    failed: Array
+    overflow: Array
+    short: Array
+    skipped_agents: Array
+    kept: Kept | None
+
+
+def make_driver(params: PlannerParams, static: Switches) -> Driver:
+    """Returns a planner by its name on the command line; to be called inside `jit`."""
+    if static.planner in ("pdm-closed", "spdm"):
+        return planner_driver(static.planner, params, static.config)
+    if static.planner == "idm":
+        return idm_driver(max_path_points=static.config.max_path_points)
+    if static.planner == "constant-velocity":
+        return constant_velocity_driver()
+    if static.planner == "log-replay":
+        return log_replay_driver()
+    raise ValueError(f"no planner {static.planner!r}")
+
+
+def run_scene(scene: Scenario, mine: None, shared: PlannerParams, static: Switches) -> Result:
+    """Simulates one scenario and judges the run.
+
+    Args:
+      scene: one scenario on the device, of `static.num_iterations` iterations.
+      mine: nothing.
+      shared: traced settings of PDM-Closed and SPDM; the other planners do not read them.
+      static: static settings.
+    """
+    driver = make_driver(cast_params(shared, scene.ego.x.dtype), static)
+    run = simulate(scene, driver, SimulationParams(), static.simulation)
+    if static.simulation.ego == "log":
+        metrics, short = _open_loop(scene, run.plans, static.num_iterations)
+    else:
+        metrics, short = _closed_loop(scene, run.history, static.num_iterations), jnp.bool_(False)
+    kept = None
+    if static.record:
+        kept = Kept(history=run.history, plans=_shown(run.plans))
+    return Result(
+        metrics=metrics,
+        time=run.history.time,
+        samples=jnp.sum(run.history.valid, dtype=jnp.int32),
+        failed=run.failed,
+        overflow=run.overflow,
+        short=short,
+        skipped_agents=run.skipped_agents,
+        kept=kept,
+    )
+
+
+def _closed_loop(scene: Scenario, history: History, num_iterations: int) -> ClosedLoopMetrics:
+    at = scene.num_history + jnp.arange(num_iterations)
+    pick = lambda values: values[jnp.minimum(at, values.shape[0] - 1)]
+    expert = Expert(jax.tree.map(pick, scene.ego), pick(scene.ego_valid))
+    metrics = closed_loop(history, scene.map, expert)
+    # Rows tell nothing of the routes, which are the largest part by far.
+    none = jnp.zeros((0,), bool)
+    corners = CornerLanes(*(none for _ in CornerLanes._fields))
+    return metrics.replace(route=none, expert_route=none, corners=corners)
+
+
+def _open_loop(
+    scene: Scenario, plans: Plan | None, num_iterations: int
+) -> tuple[OpenLoopMetrics, jax.Array]:
+    assert plans is not None
+    samples, states = comparison_indices(num_iterations, num_iterations - 1)
+    at = scene.num_history + states
+    last = scene.time.shape[0] - 1
+    pick = lambda values: values[jnp.minimum(at, last)]
+    ego = jax.tree.map(pick, scene.ego)
+    poses = ExpertPoses(ego.x, ego.y, ego.heading, pick(scene.time).astype(ego.x.dtype))
+    known = jnp.all((at <= last) & pick(scene.ego_valid))
+    compared = jax.tree.map(lambda leaf: leaf[samples], plans)
+    return open_loop(compared, poses), ~known
+
+
+def _shown(plans: Plan | None) -> jax.Array | None:
+    if plans is None:
+        return None
+    seconds = jnp.asarray(SHOWN_SECONDS, plans.x.dtype)
+    return jax.vmap(lambda plan: jnp.stack(pose_at(plan, seconds), axis=-1))(plans)

@@ -1,0 +1,117 @@
+"""The work of a simulation on one chunk: every point drives every scene."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from spdm_experiments.loading import LoadedScenes
+from spdm_experiments.rows import Layout
+from spdm_experiments.simulate_points import Point
+from spdm_experiments.simulate_rows import histories_of, layout_of, result_rows
+from spdm_experiments.simulate_scene import UNREAD, Switches, run_scene
+from spdm_experiments.work import Arrays, Engine, Group, Job
+from spdm_jax.batching import BatchStats, SceneRunner
+from spdm_jax.simulation.agent_state import AgentSizes
+from spdm_jax.simulation.loop import SimulationConfig
+
+MAX_AGENTS = 128
+"""Reactive agents, and replayed objects, that there is room for."""
+
+
+@dataclass(frozen=True)
+class SimulateJob(Job):
+    """A simulation.
+
+    Attributes:
+      runs: the points, in their order.
+      replan_every: steps between two plans.
+      plans: whether to write the plans of every step beside the histories.
+    """
+
+    runs: list[Point]
+    replan_every: int
+    plans: bool
+
+    def layout(self) -> Layout:
+        """Returns the columns of the rows."""
+        return layout_of(self.points)
+
+    def unread(self) -> Sequence[str]:
+        """Returns the layers that nobody reads."""
+        return UNREAD
+
+    def engine(self) -> "SimulateEngine":
+        """Returns what computes the chunks."""
+        return SimulateEngine(self)
+
+
+class SimulateEngine(Engine):
+    """Computes chunks of one simulation."""
+
+    job: SimulateJob
+
+    def __init__(self, job: SimulateJob):
+        super().__init__(job)
+        self._runners: dict[tuple[Switches, int], SceneRunner] = {}
+
+    @property
+    def stats(self) -> list[BatchStats]:
+        """Counters of all programs."""
+        return [runner.stats for runner in self._runners.values()]
+
+    def compute(self, scenes: LoadedScenes, group: int) -> tuple[list[dict[str, Any]], Arrays]:
+        """Drives every scene once per point; see `Engine`."""
+        assert scenes.batch is not None
+        rows: list[dict[str, Any]] = []
+        kept: list[Arrays] = []
+        shape = self.job.groups[group]
+        tokens = [entry.token for entry in scenes.entries]
+        kinds = np.array(scenes.batch.tracks.type)
+        for number, point in enumerate(self.job.runs):
+            runner = self._runner(point, shape)
+            before = runner.stats.run_s
+            result = runner(scenes.batch, None, point.params)
+            run_ms = 1e3 * (runner.stats.run_s - before) / len(tokens)
+            known = (scenes.entries, scenes.track_ids, kinds)
+            rows += result_rows(self.layout, *known, result, number, run_ms)
+            if self.job.arrays:
+                ids = scenes.track_ids
+                kept.append(histories_of(result, tokens, ids, number, scenes.origins))
+        return rows, _join(kept)
+
+    def _runner(self, point: Point, group: Group) -> SceneRunner:
+        switches = switches_of(point, group, self.job)
+        runner = self._runners.get((switches, group.chunk))
+        if runner is None:
+            batching = replace(self.job.batching, chunk=group.chunk)
+            runner = SceneRunner(run_scene, switches, precision=self.job.precision, config=batching)
+            self._runners[switches, group.chunk] = runner
+        return runner
+
+
+def switches_of(point: Point, group: Group, job: SimulateJob) -> Switches:
+    """Returns what the program of a point and a shape is made from."""
+    assert group.num_iterations is not None
+    is_open = point.mode == "open"
+    room = min(group.padding.tracks[0], MAX_AGENTS)
+    simulation = SimulationConfig(
+        num_samples=group.num_iterations - 1,
+        traffic="reactive" if point.traffic == "reactive" else "replay",
+        ego="log" if is_open else "two_stage",
+        replan_every=job.replan_every,
+        record_plans=is_open or job.plans,
+        sizes=AgentSizes(agents=room, replayed=room),
+    )
+    config = replace(point.config, max_path_points=group.max_path_points)
+    record = job.arrays is not None
+    return Switches(point.planner, config, simulation, group.num_iterations, record)
+
+
+def _join(kept: Sequence[Arrays]) -> Arrays:
+    """Puts the runs of all points one after the other; they differ in nothing but the point."""
+    if not kept:
+        return {}
+    names = [name for name in kept[0] if all(name in part for part in kept)]
+    return {name: np.concatenate([part[name] for part in kept]) for name in names}
