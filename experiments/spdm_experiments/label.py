@@ -26,7 +26,7 @@ from spdm_experiments.run_folder import Progress, alone, note
 from spdm_experiments.runtime import configure_jax, now, provenance, stop_between_chunks
 from spdm_experiments.terminal import RateLine, print_files, reasons
 from spdm_jax import PlannerConfig
-from spdm_jax.batching import ShapeGroup, group_by_shape, prefetch
+from spdm_jax.batching import ShapeGroup, group_by_shape
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.labels import INDEX
 from spdm_jax.padding import PATH_ROOM, bucket
@@ -234,7 +234,7 @@ def _work(
         line.show(len(tally.done), 0.0, 0, 0.0)
         save()
         labels, rows = [], []
-        for piece in prefetch(labeller.load(chunks)):
+        for piece in labeller.load(chunks):
             mine, index = labeller.score(piece)
             labels.append(mine)
             rows += index
