@@ -12,11 +12,10 @@ Either way a scene's result does not depend on its neighbours or on the size of 
 """
 
 import os
-import queue
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any, Literal, TypeVar
@@ -32,6 +31,7 @@ from spdm_jax.schema import LEAVES
 from spdm_jax.types import Scenario, ScenarioBatch
 
 Precision = Literal["f32", "f64"]
+S = TypeVar("S")
 T = TypeVar("T")
 
 MAX_GROUPS = 4
@@ -416,43 +416,23 @@ def group_by_shape(
     ]
 
 
-def prefetch(items: Iterable[T], depth: int = 1) -> Iterator[T]:
-    """Yields the items of an iterable that a thread computes ahead of time.
+def prefetch(make: Callable[[S], T], items: Iterable[S], threads: int = 2) -> Iterator[T]:
+    """Yields `make` of each item, in order, made ahead of time by some threads.
 
     Args:
-      items: consumed in a thread of its own; what it raises is raised here, in its place.
-      depth: items ready at most, besides the one in use and the one being made.
+      make: called in a thread; what it raises is raised here, in its place.
+      items: arguments; taken one by one, as many ahead as there are threads.
+      threads: items in the making at a time.
     """
-    ready: queue.Queue[tuple[bool, Any]] = queue.Queue(depth)
-    stopped = threading.Event()
-
-    def put(entry: tuple[bool, Any]) -> None:
-        while not stopped.is_set():
-            try:
-                return ready.put(entry, timeout=0.1)
-            except queue.Full:
-                continue
-
-    def work() -> None:
+    ahead: deque[Future[T]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
         try:
             for item in items:
-                put((True, item))
-                if stopped.is_set():
-                    return
-            put((False, None))
-        except BaseException as error:  # handed to the consumer
-            put((False, error))
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        while True:
-            real, entry = ready.get()
-            if not real:
-                if entry is not None:
-                    raise entry
-                return
-            yield entry
-    finally:
-        stopped.set()
-        thread.join()
+                ahead.append(pool.submit(make, item))
+                if len(ahead) > threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for future in ahead:
+                future.cancel()

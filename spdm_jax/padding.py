@@ -59,7 +59,7 @@ class PaddingConfig:
       crosswalk_edges, walkway_edges, stop_line_edges: see lane_edges.
       grid_cells: cells of the polygon grid.
       grid_masks: distinct sets of polygons at cell centres.
-      grid_rows: cells crossed by an edge, plus one.
+      grid_rows: cells crossed by an edge, and the distinct kinds of others.
       grid_edges: edges of all cells, an edge counted in each.
       route_roadblocks: roadblocks of a route.
       slots: lanes of a route.

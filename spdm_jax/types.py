@@ -108,11 +108,11 @@ class PolygonGrid(struct.PyTreeNode, kw_only=True):
       origin: `[2]` lower left corner of cell (0, 0).
       cell_size: `[]` m.
       shape: `[2]` int32, number of cells in x and y; cell (i, j) is stored at `i * ny + j`.
-      cell_mask: `[C]` int32, row of `masks` for the cell centre.
-      cell_edges: `[C]` int32, row of `edge_start` and `edge_count`; row 0 has no edges.
+      cell_row: `[C]` int32, row of each cell; cells without edges and with one mask share a row.
+      row_mask: `[K]` int32, row of `masks` for the cell's centre.
+      edge_start: `[K]` int32, first edge of the row's cell.
+      edge_count: `[K]` int32, number of its edges; row 0 has none.
       masks: `[U, W]` uint32, bit sets of polygons.
-      edge_start: `[K]` int32, first edge of the cells of a row.
-      edge_count: `[K]` int32, number of their edges.
       edges: `[E, 4]` x0, y0, x1, y1 relative to the cell's centre, row after row.
       edge_polygon: `[E]` int32, polygon of each edge, -1 for padding.
     """
@@ -120,11 +120,11 @@ class PolygonGrid(struct.PyTreeNode, kw_only=True):
     origin: Array
     cell_size: Array
     shape: Array
-    cell_mask: Array
-    cell_edges: Array
-    masks: Array
+    cell_row: Array
+    row_mask: Array
     edge_start: Array
     edge_count: Array
+    masks: Array
     edges: Array
     edge_polygon: Array
 

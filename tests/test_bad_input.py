@@ -228,7 +228,7 @@ def drop_field(path: FilePath) -> None:
     [
         (truncate, "b.npz: damaged scenario file"),
         (empty, "b.npz: damaged scenario file"),
-        (later_schema, "b.npz: schema_version is 999, this library reads 1"),
+        (later_schema, "b.npz: schema_version is 999, this library reads 2"),
         (drop_field, r"b.npz: missing fields \['tracks.vx.npy'\]"),
     ],
     ids=lambda v: getattr(v, "__name__", ""),

@@ -51,9 +51,9 @@ def polygons_at(grid: PolygonGrid, points: np.ndarray) -> list[set[int]]:
     centers = grid.origin + (np.stack([i, j], 1) + 0.5) * grid.cell_size
     found = []
     for cell, center, point in zip(cells, centers, points, strict=True):
-        words = grid.masks[grid.cell_mask[cell]]
+        row = grid.cell_row[cell]
+        words = grid.masks[grid.row_mask[row]]
         inside = {n for n in range(32 * len(words)) if words[n // 32] >> (n % 32) & 1}
-        row = grid.cell_edges[cell]
         own = slice(grid.edge_start[row], grid.edge_start[row] + grid.edge_count[row])
         edges = grid.edges[own]
         way = shapely.LineString([(0, 0), point - center])

@@ -67,7 +67,7 @@ class Local:
     def run(self, job: Job, chunks: Sequence[Chunk], stop: Callable[[], bool]) -> Iterator[Done]:
         """Computes chunks until all are done or the user wants to stop."""
         engine, loader = job.engine(), job.loader()
-        loads = prefetch(load_chunk(chunk, job, loader) for chunk in chunks)
+        loads = prefetch(lambda chunk: load_chunk(chunk, job, loader), chunks)
         for loaded in loads:
             yield engine.process(loaded)
             if stop():

@@ -25,7 +25,7 @@ from spdm_experiments.runtime import configure_jax, now, provenance
 from spdm_experiments.sequence import Verb, go_on, usable_inventory
 from spdm_experiments.work import Done
 from spdm_jax import Failure, PlannerConfig
-from spdm_jax.batching import ShapeGroup, group_by_shape, prefetch
+from spdm_jax.batching import ShapeGroup, group_by_shape
 from spdm_jax.labels import INDEX
 from spdm_jax.padding import PATH_ROOM, bucket
 from spdm_jax.trajectories import check_trajectories, resample
@@ -161,10 +161,11 @@ class LabelRun(Verb):
         labels: list[np.ndarray] = []
         rows: list[dict[str, Any]] = []
         before, load_s = labeller.counters(), 0.0
-        for piece in prefetch(labeller.load(list(self._chunks(shard, missing)))):
+        for piece in labeller.load(list(self._chunks(shard, missing))):
             mine, index = labeller.score(piece)
             labels.append(mine)
             rows += index
+            piece.scenes.release()
             piece.scenes.release()
             load_s += piece.seconds
             if not piece.last:

@@ -14,7 +14,7 @@ from spdm_experiments.record import REASONS
 from spdm_experiments.sweep_scene import UNREAD
 from spdm_jax import Failure, PlannerParams
 from spdm_jax.api import BLOCK_SIZES
-from spdm_jax.batching import BatchConfig, Precision, SceneRunner, padded_bytes
+from spdm_jax.batching import BatchConfig, Precision, SceneRunner, padded_bytes, prefetch
 from spdm_jax.config import NUM_STATES
 from spdm_jax.padding import PaddingConfig, bucket
 from spdm_jax.trajectories import STATE_COLUMNS
@@ -107,18 +107,24 @@ class Labeller:
         return scene + self.parts * self.block * NUM_STATES * len(STATE_COLUMNS) * 8
 
     def load(self, chunks: Sequence[Chunk]) -> Iterator[Piece]:
-        """Reads scenes and brings the vocabulary to them."""
+        """Reads scenes and brings the vocabulary to them, a little ahead of their use."""
         # float64, so that trajectories are placed as `spdm score` places them.
         loader = Loader(unread=UNREAD)
-        for chunk in chunks:
-            runs = split(len(chunk.entries), chunk.group.piece)
-            for run in runs:
-                started = time.perf_counter()
-                entries = [chunk.entries[i] for i in run]
-                scenes = loader.load(entries, chunk.group.padding)
-                parts = None if scenes.batch is None else self._parts(scenes.batch, chunk)
-                seconds = time.perf_counter() - started
-                yield Piece(chunk, run is runs[-1], scenes, parts, seconds)
+
+        def read(item: tuple[Chunk, bool, Sequence[int]]) -> Piece:
+            chunk, last, run = item
+            started = time.perf_counter()
+            scenes = loader.load([chunk.entries[i] for i in run], chunk.group.padding)
+            parts = None if scenes.batch is None else self._parts(scenes.batch, chunk)
+            return Piece(chunk, last, scenes, parts, time.perf_counter() - started)
+
+        items = [
+            (chunk, run is runs[-1], run)
+            for chunk in chunks
+            for runs in [split(len(chunk.entries), chunk.group.piece)]
+            for run in runs
+        ]
+        return prefetch(read, items)
 
     def _parts(self, batch: ScenarioBatch, chunk: Chunk) -> Part:
         count, rows = len(self.vocabulary), self.parts * self.block

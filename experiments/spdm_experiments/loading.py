@@ -7,6 +7,7 @@ are checked (type, shape, check sum) as `read_scenario` does.
 
 import io
 import json
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -43,7 +44,7 @@ class LoadedScenes:
 
 
 class Loader:
-    """Reads and pads scenario files into memory that is used again.
+    """Reads and pads scenario files into memory that is used again; several threads may load.
 
     Fresh memory is expensive: a chunk would take as long to get it from the system as to fill it.
 
@@ -55,6 +56,7 @@ class Loader:
     def __init__(self, *, unread: Sequence[str] = (), dtype: type[np.floating] = np.float64):
         self._needed = [path for path in LEAVES if not path.startswith(tuple(unread))]
         self._dtype = dtype
+        self._lock = threading.Lock()
         self._spare: dict[PaddingConfig, list[tuple[int, PaddedStack]]] = {}
 
     def load(self, entries: Sequence[Entry], padding: PaddingConfig) -> LoadedScenes:
@@ -91,13 +93,14 @@ class Loader:
     def _stack(
         self, count: int, padding: PaddingConfig, sizes: dict[str, int]
     ) -> tuple[int, PaddedStack]:
-        if padding not in self._spare:
-            self._spare = {padding: []}  # one shape after the other
-        if self._spare[padding]:
-            room, stack = self._spare[padding].pop()
-            if room >= count:
-                stack.clear()
-                return room, stack
+        with self._lock:
+            if padding not in self._spare:
+                self._spare = {padding: []}  # one shape after the other
+            spare = self._spare[padding]
+            room, stack = spare.pop() if spare else (0, None)
+        if stack is not None and room >= count:
+            stack.clear()
+            return room, stack
         return count, PaddedStack(count, sizes, paths=self._needed, dtype=self._dtype)
 
 

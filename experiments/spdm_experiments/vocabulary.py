@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import repeat
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -203,7 +203,7 @@ def _proposals(
         runs = split(len(entries), max(1, MEMORY // each))
         loader, padding = Loader(unread=UNREAD), group.padding
         parts = [[entries[i] for i in rows] for rows in runs]
-        for scenes in prefetch(map(loader.load, parts, repeat(padding))):
+        for scenes in prefetch(partial(loader.load, padding=padding), parts):
             for failure, _ in scenes.failures:
                 failed[failure.token] = failure.reason
                 yield np.zeros((0, NUM_STATES, 3))

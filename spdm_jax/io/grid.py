@@ -117,9 +117,12 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
         masks[cells[inside], bit // 32] |= np.uint32(1 << (bit % 32))
     unique, cell_mask = _unique_rows(masks)
 
-    cell_edges = np.zeros(nx * ny, np.int32)
+    # A row for each mask, for cells without edges; then one for each cell that has some.
+    cell_row = cell_mask.reshape(-1).astype(np.int32)
     cells, first, counts = np.unique(pairs[:, 0], return_index=True, return_counts=True)
-    cell_edges[cells] = np.arange(1, len(cells) + 1)
+    plain = np.zeros(len(unique), int)
+    row_mask = np.append(np.arange(len(unique)), cell_row[cells])
+    cell_row[cells] = len(unique) + np.arange(len(cells))
     table, owner = edges[pairs[:, 1]] - np.tile(centers[pairs[:, 0]], 2), rows[pairs[:, 1]]
     if not len(pairs):  # there is something to index, though nobody does
         table, owner = np.zeros((1, 4)), np.array([-1])
@@ -127,11 +130,11 @@ def _pack(origin, size, shape, pairs, edges, rows, polygons) -> PolygonGrid:
         origin=np.asarray(origin, float),
         cell_size=np.asarray(size, float),
         shape=np.array([nx, ny], np.int32),
-        cell_mask=cell_mask.reshape(-1).astype(np.int32),
-        cell_edges=cell_edges,
+        cell_row=cell_row,
+        row_mask=row_mask.astype(np.int32),
+        edge_start=np.append(plain, first).astype(np.int32),
+        edge_count=np.append(plain, counts).astype(np.int32),
         masks=unique,
-        edge_start=np.append(0, first).astype(np.int32),
-        edge_count=np.append(0, counts).astype(np.int32),
         edges=table,
         edge_polygon=owner.astype(np.int32),
     )

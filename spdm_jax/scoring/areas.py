@@ -75,12 +75,11 @@ def containing_polygons(grid: PolygonGrid, x: jax.Array, y: jax.Array) -> tuple[
     cell = jnp.where(inside, i * grid.shape[1] + j, 0)
     px = x - (grid.origin[0] + (i.astype(x.dtype) + 0.5) * grid.cell_size)
     py = y - (grid.origin[1] + (j.astype(y.dtype) + 0.5) * grid.cell_size)
-    mask_row = grid.cell_mask[cell]
-    edge_row = jnp.where(inside, grid.cell_edges[cell], 0)
-    num_words = grid.masks.shape[1]
-    words = [jnp.where(inside, grid.masks[mask_row, w], jnp.uint32(0)) for w in range(num_words)]
+    row = jnp.where(inside, grid.cell_row[cell], 0)  # row 0 has no edges
+    mask, num_words = grid.row_mask[row], grid.masks.shape[1]
+    words = [jnp.where(inside, grid.masks[mask, w], jnp.uint32(0)) for w in range(num_words)]
 
-    first, count = grid.edge_start[edge_row], grid.edge_count[edge_row]
+    first, count = grid.edge_start[row], grid.edge_count[row]
 
     def flip(number, words):
         edge = first + number

@@ -64,15 +64,15 @@ def padded_grid(polygons, dtype) -> PolygonGrid:
     grid = build_grid(polygons)
     rows = power_bucket(grid.edge_start.shape[0], 2048)
     edges = power_bucket(grid.edges.shape[0], 16384)
-    cells = power_bucket(grid.cell_mask.shape[0], 32768)
+    cells = power_bucket(grid.cell_row.shape[0], 32768)
     masks = power_bucket(grid.masks.shape[0], 512)
     words = power_bucket(grid.masks.shape[1], 4)
     return PolygonGrid(
         origin=jnp.asarray(grid.origin, dtype),
         cell_size=jnp.asarray(grid.cell_size, dtype),
         shape=jnp.asarray(grid.shape),
-        cell_mask=jnp.asarray(pad(grid.cell_mask, cells)),
-        cell_edges=jnp.asarray(pad(grid.cell_edges, cells)),
+        cell_row=jnp.asarray(pad(grid.cell_row, cells)),
+        row_mask=jnp.asarray(pad(grid.row_mask, rows)),
         masks=jnp.asarray(pad(pad(grid.masks, masks), words, 1)),
         edge_start=jnp.asarray(pad(grid.edge_start, rows)),
         edge_count=jnp.asarray(pad(grid.edge_count, rows)),
