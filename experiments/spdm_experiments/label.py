@@ -166,7 +166,6 @@ class LabelRun(Verb):
             labels.append(mine)
             rows += index
             piece.scenes.release()
-            piece.scenes.release()
             load_s += piece.seconds
             if not piece.last:
                 continue
