@@ -66,7 +66,7 @@ def in_map(raw: RawScenario, state: EgoState) -> np.ndarray:
     return np.stack([state.x + origin[0], state.y + origin[1], state.heading], -1)
 
 
-@pytest.mark.parametrize("planner", ["PDM", "SPDM"])
+@pytest.mark.parametrize("planner", ["PDM", pytest.param("SPDM", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "angle, shift", [(0.0, (12.34, -56.78)), (np.pi / 2, (0.0, 0.0)), (2.1, (3.3e5, 4.7e6))]
 )

@@ -154,6 +154,7 @@ def test_rows_say_how_the_drive_went(whole: Path):
         assert row["score"] == pytest.approx(gates * terms, abs=1e-5), (token, point)
 
 
+@pytest.mark.slow
 def test_scenes_do_not_depend_on_their_neighbours(pack: Path, whole: Path, tmp_path: Path):
     alone = tmp_path / "alone"
     alone.mkdir()
@@ -436,9 +437,9 @@ def test_programs_are_shared_by_all_scenes(whole: Path):
 
 @pytest.mark.slow
 def test_padding_changes_nothing(pack: Path, whole: Path, tmp_path: Path, monkeypatch):
-    from spdm_experiments import simulate
+    from spdm_experiments import grid_run
 
-    group = simulate.group_of
+    group = grid_run.group_of
 
     def larger(options: Any, padding: Any, *given: Any, **more: Any) -> Any:
         sizes = {name: (2 * getattr(padding, name)[0],) for name in ("lanes", "tracks")}

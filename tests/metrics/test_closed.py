@@ -467,6 +467,7 @@ def statistics_of(metrics) -> dict:
     return {k: {n: v for n, v in s.items()} for k, s in statistics(metrics).items()}
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_runs():
     ego, things = busy()
     runs = [history_of(ego, things), history_of(drive())]
@@ -478,6 +479,7 @@ def test_a_batch_is_its_runs():
         close(jax.tree.map(lambda v, i=i: v[i], many), single)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32_and_agrees():
     ego, things = busy()
     history = history_of(ego, things, dtype=jnp.float32)

@@ -20,6 +20,8 @@ from spdm_jax.simulation.mobil_driver import (
     mobil_gain,
 )
 
+pytestmark = pytest.mark.slow  # compiles several simulations
+
 SAMPLES = 98
 DRIVER = mobil_driver(max_path_points=512)
 WIDTH = roads.LANE_WIDTH

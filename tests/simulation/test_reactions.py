@@ -21,6 +21,8 @@ from spdm_jax.simulation.placement import place_agents
 from spdm_jax.simulation.reactions import Future, reactions, steps_ahead
 from spdm_jax.types import AgentForecast, ObjectType
 
+pytestmark = pytest.mark.slow  # compiles several simulations
+
 SAMPLES = 60
 SIZES = AgentSizes(agents=4, replayed=4, path_points=401, outline_blocks=1)
 THINGS = [

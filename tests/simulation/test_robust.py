@@ -26,6 +26,8 @@ from spdm_jax.simulation.loop import (
 )
 from spdm_jax.types import ObjectType, Scenario
 
+pytestmark = pytest.mark.slow  # compiles several simulations
+
 SAMPLES = 80
 SIZES = AgentSizes(agents=8, replayed=8, path_points=401, outline_blocks=1)
 STRAIGHT, IDM = constant_velocity_driver(), idm_driver(max_path_points=512)

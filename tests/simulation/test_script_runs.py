@@ -26,6 +26,8 @@ from spdm_jax.simulation.placement import place_agents
 from spdm_jax.simulation.script import AgentPolicy, Script, ego_reach, heeds_reach
 from spdm_jax.types import ObjectType
 
+pytestmark = pytest.mark.slow  # compiles several simulations
+
 SAMPLES = 80
 SIZES = AgentSizes(agents=8, replayed=8, path_points=401, outline_blocks=1)
 CONFIG = SimulationConfig(num_samples=SAMPLES, traffic="reactive", sizes=SIZES)
