@@ -445,7 +445,7 @@ def test_padding_changes_nothing(pack: Path, whole: Path, tmp_path: Path, monkey
         sizes = {name: (2 * getattr(padding, name)[0],) for name in ("lanes", "tracks")}
         return group(options, dataclasses.replace(padding, **sizes), *given, **more)
 
-    monkeypatch.setattr(simulate, "group_of", larger)
+    monkeypatch.setattr("spdm_experiments.simulate.group_of", larger)
     assert run(pack, tmp_path / "run", *DRIVERS) == 0
     assert_frame_equal(rows(tmp_path / "run"), rows(whole), abs_tol=1e-5)
 
