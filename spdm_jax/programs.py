@@ -89,7 +89,7 @@ def program(
         else:
             traced = make().trace(*args)
             lowered, used = traced.lower(), _used(traced.jaxpr.jaxpr)
-            twin = path and _twin(path, lowered, devices)
+            twin = path and _twin(path, lowered, (str(tree), shapes, used), devices)
             stored = twin and _load(twin, tree, devices)
             if stored:
                 call, _ = stored
@@ -106,9 +106,13 @@ def program(
         return made, True
 
 
-def _twin(path: Path, lowered: Any, devices: Sequence) -> Path:
-    """Returns where a program lies under its own text: other source may have given the same."""
-    text = hashlib.sha256(lowered.as_text().encode())
+def _twin(path: Path, lowered: Any, arguments: tuple, devices: Sequence) -> Path:
+    """Returns where a program lies under its own text: other source may have given the same.
+
+    The text says nothing of arguments that the function does not read, but a stored program knows
+    its arguments by their places among all of them.
+    """
+    text = hashlib.sha256((repr(arguments) + lowered.as_text()).encode())
     return path.with_name(f"{_platform(devices)}-{text.hexdigest()}")
 
 

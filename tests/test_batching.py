@@ -28,6 +28,7 @@ from spdm_jax.batching import (
 )
 from spdm_jax.compile_cache import ENVIRONMENT_VARIABLE
 from spdm_jax.padding import PaddingConfig, sizes_of
+from spdm_jax.programs import program
 from spdm_jax.schema import LEAVES
 from spdm_jax.synthetic import make_scene
 
@@ -194,6 +195,19 @@ def test_stored_programs_start_a_new_process(tmp_path: Path):
     assert not third["stored"] and third["result"] == first["result"]
     other = child("stored", 1, tmp_path, "2.5")  # another setting is another program
     assert not other["stored"] and other["result"] != first["result"]
+
+
+def thrice(values):
+    return 3 * values["read"]
+
+
+def test_stored_program_is_not_taken_for_one_with_other_arguments():
+    """What a function does not read is not in its text, but counts where it is called."""
+    make, device = lambda: jax.jit(thrice), jax.devices()[:1]
+    before, after = {"also": np.zeros(3)}, {"unread": np.zeros(4)}
+    for values in ({**before, "read": np.ones(2)}, {"read": np.ones(2), **after}):
+        made, _ = program("twins", thrice, make, (values,), device)
+        np.testing.assert_array_equal(made.call(values), 3 * values["read"])
 
 
 def own_sizes(scenes: ScenarioSet) -> list[dict[str, int]]:
