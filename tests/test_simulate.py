@@ -348,6 +348,10 @@ def test_a_suite_is_packed_like_any_source(tmp_path: Path):
 # --- the report
 
 
+def by_score(token: str, table: polars.DataFrame) -> float:
+    return table.filter(token=token, point=0)["score"].item()
+
+
 def test_report_of_a_simulation(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     page = tmp_path / "page.html"
     assert cli.main(["report", str(whole), "--out", str(page), "--players", "3"]) == 0
@@ -367,6 +371,14 @@ def test_report_of_a_simulation(whole: Path, tmp_path: Path, capsys: pytest.Capt
         "Constant velocity",
         "Log replay",
     }
+    (types,) = data["types"]
+    assert [(t["type"], t["scenarios"]) for t in types] == [
+        ("c-type", 2),
+        ("f-type", 1),
+        ("l-type", 1),
+        ("s-type", 1),
+    ]
+    assert types[0]["means"] == pytest.approx([0.5 * by_score("clear", table)] * 2, abs=1e-4)
     worst = data["lists"][0]["rows"][0]
     assert worst["token"] == "crash" and worst["term"] == "No at-fault collision"
     assert "with vehicle parked at 0." in worst["reason"]

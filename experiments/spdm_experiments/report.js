@@ -82,7 +82,9 @@ function drawSummary(part) {
     for (const [name, value] of run.about) {
       list.append(element("div", null, {}, element("dt", name), element("dd", value)));
     }
-    part.append(list, pointTable(data.points.filter((p) => p.run === i)));
+    const points = data.points.filter((p) => p.run === i);
+    part.append(list, pointTable(points));
+    if (data.types[i].length) part.append(element("h3", "Mean score by scenario type"), typeTable(points, data.types[i]));
   });
   part.append(element("p", "Means over the scenarios with scores; the interval is a bootstrap over scenarios. Failed scenarios are "
     + `counted and not averaged in. ${data.terms.slice(1).map((t) => `${t.short} ${t.title.toLowerCase()}`).join(", ")}, ${data.words.summary}`,
@@ -107,6 +109,12 @@ function pointTable(points) {
     fixed(p.means[data.metres], 1),
     ...(data.braking ? [p.braking === null ? "–" : `${(100 * p.braking).toFixed(1)} %`] : []), fixed(p.ms, 1),
   ], { mark: (line, p) => line.classList.toggle("best", p.means.total === best) });
+}
+
+function typeTable(points, types) {
+  const columns = [{ title: "Type", text: "text", value: (t) => t.type }, { title: "scenarios", value: (t) => t.scenarios },
+    ...points.map((p, k) => ({ title: p.title, value: (t) => t.means[k] }))];
+  return table(columns, types, (t) => [t.type, String(t.scenarios), ...t.means.map((mean) => fixed(mean, 3))], { sortable: true });
 }
 
 function pairedTable() {

@@ -249,6 +249,22 @@ def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
     return found
 
 
+def by_type(run: Run) -> dict[str, tuple[int, list[float]]]:
+    """Returns scenarios and mean score at every grid point, by the type of the scenarios.
+
+    A mean is NaN where no scenario of the type has a score; types are in alphabetical order.
+    """
+    good = run.rows.filter(polars.col("status") == "ok")
+    if "scenario_type" not in good.columns:
+        return {}
+    found: dict[str, tuple[int, list[float]]] = {}
+    for (kind,), mine in good.group_by("scenario_type"):
+        means = dict(mine.group_by("point").agg(polars.col("total").mean()).iter_rows())
+        scores = [float(means.get(point, np.nan)) for point in range(len(run.points))]
+        found[str(kind or "")] = (mine["token"].n_unique(), scores)
+    return dict(sorted(found.items()))
+
+
 def _mean(frame: polars.DataFrame, column: str) -> float:
     """Mean of a column, NaN where there is none."""
     if column not in frame.columns:

@@ -127,6 +127,7 @@ def page_data(
             for number, run in enumerate(runs)
             for summary, title in zip(summaries[number], titles[number], strict=True)
         ],
+        "types": [_types(run) for run in runs],
         "axes": _axes(runs, names, start),
         "paired": [
             _paired(numbers.paired_difference(runs[0], runs[1], pair, seed), start)
@@ -235,6 +236,16 @@ def _point(
         "braking": _number(summary.braking),
         "ms": _number(summary.ms),
     }
+
+
+def _types(run: Run) -> list[dict[str, Any]]:
+    """Mean scores of scenario types, if there are several."""
+    found = numbers.by_type(run)
+    return [
+        {"type": kind, "scenarios": count, "means": [_number(mean) for mean in means]}
+        for kind, (count, means) in found.items()
+        if len(found) > 1
+    ]
 
 
 def _parameter(point: Mapping[str, Any], key: str) -> str:
