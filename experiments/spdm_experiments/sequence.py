@@ -5,6 +5,7 @@ chunk, each written as a part; stop between chunks; say how it stands. A verb sa
 and its chunks are (`Verb`).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ from spdm_jax import Failure
 from spdm_jax.io.raw import ScenarioError
 
 
-class Verb:
+class Verb(ABC):
     """What a verb brings to the sequence.
 
     Attributes:
@@ -35,36 +36,36 @@ class Verb:
     origin: dict[str, object]
     serial = True
 
+    @abstractmethod
     def open(self) -> list[str]:
         """Describes the folder or checks it; returns what the user should know.
 
         Raises:
           ValueError: the folder holds something else.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def clean(self, shard: Shard) -> None:
         """Removes what killed processes of a shard left half done."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read_done(self) -> tuple[dict[str, str], list[str]]:
         """Returns token -> reason ("" where all is well) of what is done, and notes."""
-        raise NotImplementedError
 
+    @abstractmethod
     def write_unusable(self, name: str, failures: Sequence[Failure]) -> None:
         """Writes the part of scenarios whose files cannot be used."""
-        raise NotImplementedError
 
+    @abstractmethod
     def run(self, shard: Shard, missing: set[str], stop: Callable[[], bool]) -> Iterator[Done]:
         """Computes what is missing, chunk by chunk, until the user wants to stop."""
-        raise NotImplementedError
 
-    def finish(self) -> None:
+    def finish(self) -> None:  # noqa: B027 - most verbs have nothing left to do
         """Does what comes after the last scenario, in a process that does not only see a shard."""
 
+    @abstractmethod
     def tell(self) -> None:
         """Prints the results so far."""
-        raise NotImplementedError
 
 
 @dataclass

@@ -12,7 +12,6 @@ from spdm_experiments.simulate_points import Point
 from spdm_experiments.simulate_rows import histories_of, layout_of, result_rows
 from spdm_experiments.simulate_scene import UNREAD, Switches, run_scene
 from spdm_experiments.work import Arrays, Engine, Group, Job
-from spdm_jax.batching import BatchStats, SceneRunner
 from spdm_jax.simulation.agent_state import AgentSizes
 from spdm_jax.simulation.loop import SimulationConfig
 
@@ -52,15 +51,6 @@ class SimulateEngine(Engine):
 
     job: SimulateJob
 
-    def __init__(self, job: SimulateJob):
-        super().__init__(job)
-        self._runners: dict[tuple[Switches, int], SceneRunner] = {}
-
-    @property
-    def stats(self) -> list[BatchStats]:
-        """Counters of all programs."""
-        return [runner.stats for runner in self._runners.values()]
-
     def compute(self, scenes: LoadedScenes, group: int) -> tuple[list[dict[str, Any]], Arrays]:
         """Drives every scene once per point; see `Engine`."""
         assert scenes.batch is not None
@@ -70,7 +60,7 @@ class SimulateEngine(Engine):
         tokens = [entry.token for entry in scenes.entries]
         kinds = np.array(scenes.batch.tracks.type)
         for number, point in enumerate(self.job.runs):
-            runner = self._runner(point, shape)
+            runner = self.runner(run_scene, switches_of(point, shape, self.job), shape.chunk)
             before = runner.stats.run_s
             result = runner(scenes.batch, None, point.params)
             run_ms = 1e3 * (runner.stats.run_s - before) / len(tokens)
@@ -80,15 +70,6 @@ class SimulateEngine(Engine):
                 ids = scenes.track_ids
                 kept.append(histories_of(result, tokens, ids, number, scenes.origins))
         return rows, _join(kept)
-
-    def _runner(self, point: Point, group: Group) -> SceneRunner:
-        switches = switches_of(point, group, self.job)
-        runner = self._runners.get((switches, group.chunk))
-        if runner is None:
-            batching = replace(self.job.batching, chunk=group.chunk)
-            runner = SceneRunner(run_scene, switches, precision=self.job.precision, config=batching)
-            self._runners[switches, group.chunk] = runner
-        return runner
 
 
 def switches_of(point: Point, group: Group, job: SimulateJob) -> Switches:

@@ -15,7 +15,6 @@ from spdm_experiments.sweep_rows import layout_of, poses_of, scored_rows
 from spdm_experiments.sweep_scene import UNREAD, Reading, Shared, Switches, read_scene
 from spdm_experiments.work import Arrays, Engine, Job
 from spdm_jax import PlannerConfig, PlannerParams
-from spdm_jax.batching import BatchStats, SceneRunner
 from spdm_jax.types import ScenarioBatch
 
 
@@ -46,15 +45,6 @@ class SweepEngine(Engine):
     """Computes chunks of one sweep."""
 
     job: SweepJob
-
-    def __init__(self, job: SweepJob):
-        super().__init__(job)
-        self._runners: dict[tuple[Switches, int], SceneRunner] = {}
-
-    @property
-    def stats(self) -> list[BatchStats]:
-        """Counters of all programs."""
-        return [runner.stats for runner in self._runners.values()]
 
     def compute(self, scenes: LoadedScenes, group: int) -> tuple[list[dict[str, Any]], Arrays]:
         """Computes every run of the grid; see `Engine`."""
@@ -97,13 +87,7 @@ class SweepEngine(Engine):
         chunk: int,
     ) -> tuple[Reading, float]:
         switches = Switches(config, self.job.arrays is not None)
-        runner = self._runners.get((switches, chunk))
-        if runner is None:
-            batching = replace(self.job.batching, chunk=chunk)
-            runner = SceneRunner(
-                read_scene, switches, precision=self.job.precision, config=batching
-            )
-            self._runners[switches, chunk] = runner
+        runner = self.runner(read_scene, switches, chunk)
         shared = Shared(
             params=params,
             num_proposals=np.array(num_proposals, np.int32),

@@ -5,8 +5,9 @@ at a time; nothing else is shared.
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from spdm_experiments.loading import LoadedScenes, Loader
 from spdm_experiments.parts import part_name
 from spdm_experiments.rows import Layout, failed_rows
 from spdm_experiments.run_folder import write_part
-from spdm_jax.batching import BatchConfig, BatchStats, Precision
+from spdm_jax.batching import BatchConfig, BatchStats, Precision, SceneRunner
 from spdm_jax.padding import PaddingConfig
 
 Arrays = dict[str, np.ndarray]
@@ -41,7 +42,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Job:
+class Job(ABC):
     """What all chunks of a run have in common.
 
     Attributes:
@@ -60,17 +61,17 @@ class Job:
     batching: BatchConfig
     arrays: str | None
 
+    @abstractmethod
     def layout(self) -> Layout:
         """Returns the columns of the rows."""
-        raise NotImplementedError
 
+    @abstractmethod
     def unread(self) -> Sequence[str]:
         """Returns prefixes of the scenario's fields that nobody reads."""
-        raise NotImplementedError
 
+    @abstractmethod
     def engine(self) -> "Engine":
         """Returns what computes the chunks."""
-        raise NotImplementedError
 
     def loader(self) -> Loader:
         """Returns what reads the scenarios."""
@@ -133,19 +134,36 @@ def load_chunk(chunk: Chunk, job: Job, loader: Loader) -> Loaded:
     return Loaded(chunk, scenes, time.perf_counter() - started)
 
 
-class Engine:
+class Engine(ABC):
     """Computes chunks of one job. A verb says how rows come from scenes (`compute`)."""
 
     def __init__(self, job: Job):
         self.job = job
         self.layout = job.layout()
+        self._runners: dict[tuple[Hashable, int], SceneRunner] = {}
         self._messages = 0
 
     @property
     def stats(self) -> list[BatchStats]:
         """Counters of all programs."""
-        raise NotImplementedError
+        return [runner.stats for runner in self._runners.values()]
 
+    def runner(self, function: Callable[..., Any], switches: Hashable, chunk: int) -> SceneRunner:
+        """Returns what runs the engine's function, one runner for each of its static settings.
+
+        Args:
+          function: as `SceneRunner` takes it, the same at every call.
+          switches: its static settings.
+          chunk: scenes per device call.
+        """
+        if (switches, chunk) not in self._runners:
+            batching = replace(self.job.batching, chunk=chunk)
+            self._runners[switches, chunk] = SceneRunner(
+                function, switches, precision=self.job.precision, config=batching
+            )
+        return self._runners[switches, chunk]
+
+    @abstractmethod
     def compute(self, scenes: LoadedScenes, group: int) -> tuple[list[dict[str, Any]], Arrays]:
         """Computes scenes that were read.
 
@@ -156,7 +174,6 @@ class Engine:
         Returns:
           Rows, one per scene and point in any order, and arrays to keep beside them (empty: none).
         """
-        raise NotImplementedError
 
     def process(self, loaded: Loaded) -> Done:
         """Computes a chunk and writes its part."""

@@ -27,6 +27,7 @@ from spdm_jax.interplan.fields import (
 )
 from spdm_jax.io.nuplan_filter import base_token
 from spdm_jax.io.raw import ScenarioError
+from spdm_jax.io.yaml_file import read_fields
 
 _DETAILS = "modification_details_dictionary"
 _EXTRA_AGENTS = ("extra_agents_to_spawn", "extra_agents_spawn_locations")
@@ -49,18 +50,7 @@ def read_modifications(path: Path | str) -> InterplanConfig:
       ScenarioError: not YAML, or a field of the wrong form; names file, token and field.
       ImportError: PyYAML is not installed.
     """
-    try:
-        import yaml
-    except ImportError as error:
-        raise ImportError("modification files need PyYAML: pip install 'spdm-jax[data]'") from error
-    try:
-        # The base loader keeps scalars as text: a token of digits only must stay a token.
-        with open(path, encoding="utf-8") as file:
-            entries = yaml.load(file, Loader=yaml.BaseLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ScenarioError(f"{path}: not a readable YAML file ({error})") from error
-    if not isinstance(entries, dict):
-        raise ScenarioError(f"{path}: holds no fields; expected interPlan's modifications")
+    entries = read_fields(path, "modification", "interPlan's modifications")
     return modifications_from(entries, str(path))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from spdm_jax.io.nuplan_log import UNTAGGED, Candidate
 from spdm_jax.io.raw import ScenarioError
+from spdm_jax.io.yaml_file import read_fields
 
 
 @dataclass(frozen=True)
@@ -167,18 +168,7 @@ class ScenarioFilter:
           ScenarioError: not YAML, an unknown field, or a field that is set but not supported.
           ImportError: PyYAML is not installed.
         """
-        try:
-            import yaml
-        except ImportError as error:
-            raise ImportError("filter files need PyYAML: pip install 'spdm-jax[data]'") from error
-        try:
-            # The base loader keeps scalars as text: a token of digits only must stay a token.
-            with open(path, encoding="utf-8") as file:
-                entries = yaml.load(file, Loader=yaml.BaseLoader)
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise ScenarioError(f"{path}: not a readable YAML file ({error})") from error
-        if not isinstance(entries, dict):
-            raise ScenarioError(f"{path}: holds no fields; expected nuPlan's scenario filter")
+        entries = read_fields(path, "filter", "nuPlan's scenario filter")
         return cls.from_mapping(entries, str(path))
 
     @classmethod

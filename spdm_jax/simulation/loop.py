@@ -15,7 +15,7 @@ from spdm_jax.agents.forecast import ForecastPoses
 from spdm_jax.agents.observation import Observation
 from spdm_jax.config import TrackerParams, VehicleParams
 from spdm_jax.geometry import ego_box
-from spdm_jax.planner import StepInput
+from spdm_jax.planner import StepInput, observe
 from spdm_jax.simulation.agent_state import (
     AgentParams,
     AgentSizes,
@@ -102,6 +102,10 @@ class Run(struct.PyTreeNode, kw_only=True):
     overflow: Array
 
 
+_OBJECT_FIELDS = tuple(Snapshot.__dataclass_fields__)
+"""What observations say of objects."""
+
+
 class _Carry(NamedTuple):
     ego: EgoState
     traffic: Traffic | None
@@ -126,38 +130,13 @@ class _Sample(NamedTuple):
 
 def logged_objects(scene: Scenario, at: jax.Array | int) -> Snapshot:
     """The recorded objects of one step of the time axis, `[A]`."""
-    tracks = scene.tracks
-    column = lambda values: values[:, at]
-    return Snapshot(
-        x=column(tracks.x),
-        y=column(tracks.y),
-        heading=column(tracks.heading),
-        vx=column(tracks.vx),
-        vy=column(tracks.vy),
-        length=column(tracks.length),
-        width=column(tracks.width),
-        type=tracks.type,
-        valid=column(tracks.valid),
-    )
+    recorded = observe(scene, at - scene.num_history).observation
+    return Snapshot(**{name: getattr(recorded, name) for name in _OBJECT_FIELDS})
 
 
 def _given(ego: EgoState, objects: Snapshot, lights: jax.Array, at: jax.Array) -> StepInput:
-    return StepInput(
-        ego=ego,
-        observation=Observation(
-            x=objects.x,
-            y=objects.y,
-            heading=objects.heading,
-            vx=objects.vx,
-            vy=objects.vy,
-            length=objects.length,
-            width=objects.width,
-            type=objects.type,
-            valid=objects.valid,
-            lights=lights,
-            step=at,
-        ),
-    )
+    seen = {name: getattr(objects, name) for name in _OBJECT_FIELDS}
+    return StepInput(ego=ego, observation=Observation(**seen, lights=lights, step=at))
 
 
 def _finite(plan: Plan) -> jax.Array:
