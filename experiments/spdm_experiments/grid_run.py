@@ -114,7 +114,8 @@ def group_of(
         size = min(largest, max(usable_cores(), MEMORY[kind] // each))
     points = max(entry.route_points for entry in entries)
     room = bucket(points, PATH_ROOM)
-    return Group(padding, room, min(size, len(entries)), num_iterations)
+    longest = max(entry.lane_points for entry in entries)
+    return Group(padding, room, longest, min(size, len(entries)), num_iterations)
 
 
 class GridRun(Verb):

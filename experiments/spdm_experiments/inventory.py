@@ -46,6 +46,7 @@ class Entry:
       token, log_name, map_name, scenario_type, source: as in `ScenarioInfo`.
       sizes: length of every free axis.
       route_points: points of the longest lane sequence that a plan may follow.
+      lane_points: points of the longest lane.
       num_iterations: length of the scenario's own window.
     """
 
@@ -57,6 +58,7 @@ class Entry:
     source: str
     sizes: Mapping[str, int]
     route_points: int
+    lane_points: int
     num_iterations: int
 
 
@@ -136,6 +138,7 @@ def _look(path: Path) -> tuple[Entry, bytes]:
             source=str(info["source"]),
             sizes=sizes,
             route_points=points,
+            lane_points=int(count.max()),
             num_iterations=int(iterations),
         )
     except UNREADABLE as error:

@@ -11,7 +11,9 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 Format = Literal["auto", "nuplan", "av2", "synthetic"]
 PlannerName = Literal["spdm", "pdm-closed"]
-SimulatedPlanner = Literal["spdm", "pdm-closed", "idm", "constant-velocity", "log-replay"]
+SimulatedPlanner = Literal[
+    "spdm", "pdm-closed", "idm", "idm-mobil", "constant-velocity", "log-replay"
+]
 Forecast = Literal["constant_velocity", "perfect", "none"]
 
 

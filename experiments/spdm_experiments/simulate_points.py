@@ -13,6 +13,7 @@ NAMES = {
     "spdm": "SPDM",
     "pdm-closed": "PDM-Closed",
     "idm": "IDM",
+    "idm-mobil": "IDM + MOBIL",
     "constant-velocity": "Constant velocity",
     "log-replay": "Log replay",
 }

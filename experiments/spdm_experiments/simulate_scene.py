@@ -33,6 +33,7 @@ from spdm_jax.simulation.drivers import (
 from spdm_jax.simulation.history import History
 from spdm_jax.simulation.idm_driver import idm_driver
 from spdm_jax.simulation.loop import SimulationConfig, SimulationParams, simulate
+from spdm_jax.simulation.mobil_driver import mobil_driver
 from spdm_jax.types import Array, Scenario
 
 UNREAD = ("map.crosswalks", "map.walkways")
@@ -102,6 +103,8 @@ def make_driver(params: PlannerParams, static: Switches) -> Driver:
         return planner_driver(static.planner, params, static.config)
     if static.planner == "idm":
         return idm_driver(max_path_points=static.config.max_path_points)
+    if static.planner == "idm-mobil":
+        return mobil_driver(max_path_points=static.config.max_path_points)
     if static.planner == "constant-velocity":
         return constant_velocity_driver()
     if static.planner == "log-replay":

@@ -12,11 +12,16 @@ from spdm_experiments.simulate_points import Point
 from spdm_experiments.simulate_rows import histories_of, layout_of, result_rows
 from spdm_experiments.simulate_scene import UNREAD, Switches, run_scene
 from spdm_experiments.work import Arrays, Engine, Group, Job
+from spdm_jax.padding import bucket
 from spdm_jax.simulation.agent_state import AgentSizes
 from spdm_jax.simulation.loop import SimulationConfig
 
 MAX_AGENTS = 128
 """Reactive agents, and replayed objects, that there is room for."""
+AGENT_PATH_ROOM = (257, 385, 513, 769, 1025, 2049, 4097)
+"""Points of an agent's path."""
+PATH_REST = 96
+"""Points that may still lie ahead of an agent when the next lane is appended: some 60 m."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,11 @@ def switches_of(point: Point, group: Group, job: SimulateJob) -> Switches:
         ego="log" if is_open else "two_stage",
         replan_every=job.replan_every,
         record_plans=is_open or job.plans,
-        sizes=AgentSizes(agents=room, replayed=room),
+        sizes=AgentSizes(
+            agents=room,
+            replayed=room,
+            path_points=bucket(group.max_lane_points + PATH_REST, AGENT_PATH_ROOM),
+        ),
     )
     config = replace(point.config, max_path_points=group.max_path_points)
     record = job.arrays is not None

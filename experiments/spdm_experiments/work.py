@@ -31,12 +31,14 @@ class Group:
     Attributes:
       padding: one size per axis.
       max_path_points: room for the points of a path.
+      max_lane_points: points of the longest lane.
       chunk: scenarios at a time.
       num_iterations: of each of them; None where the verb does not ask.
     """
 
     padding: PaddingConfig
     max_path_points: int
+    max_lane_points: int
     chunk: int
     num_iterations: int | None = None
 
