@@ -6,7 +6,7 @@ text for the user); what went wrong for single scenarios is printed and makes th
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spdm_experiments.options import (
     Demo,
@@ -40,20 +40,23 @@ def doctor(options: Doctor) -> bool:
 
 def pack(options: Pack) -> bool:
     """Packs a source into scenario files; False if a scenario failed."""
-    from spdm_experiments.sources import open_source
+    from spdm_experiments.sources import ChangedSelection, open_source
     from spdm_experiments.terminal import progress_line
+    from spdm_jax.interplan.pack import pack_interplan
     from spdm_jax.io.pack import pack as pack_reader
 
     reader, notes = open_source(options)
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     with progress_line("packing", len(reader.tokens())) as advance:
-        report = pack_reader(
-            reader,
-            options.destination,
-            overwrite=options.overwrite,
-            progress=lambda done, total, token, outcome: advance(done),
-        )
+        settings: dict[str, Any] = {
+            "overwrite": options.overwrite,
+            "progress": lambda done, total, token, outcome: advance(done),
+        }
+        if isinstance(reader, ChangedSelection):
+            report = pack_interplan(reader, options.destination, **settings)
+        else:
+            report = pack_reader(reader, options.destination, **settings)
     print(summary(report, options.destination))
     return not report.failed
 

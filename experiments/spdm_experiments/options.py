@@ -105,10 +105,13 @@ class Pack(Common):
     """nuPlan's maps folder, if it does not lie near the logs."""
     filter: Path | None = None
     """A nuPlan scenario filter, YAML."""
+    interplan: Path | None = None
+    """interPlan's modifications, YAML: changes the scenarios TOKEN-CODE that --filter or --token
+    name, and takes 30 s of each."""
     token: tuple[str, ...] = ()
     """Take these scenarios only."""
     type: tuple[str, ...] = ()
-    """Take these scenario types only (nuPlan)."""
+    """Take these scenario types only (nuPlan; with --interplan those of interPlan)."""
     log: tuple[str, ...] = ()
     """Take these logs only (nuPlan)."""
     seeds: tuple[int, ...] = (0,)

@@ -3,9 +3,15 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from spdm_experiments.options import Format, Pack
 from spdm_jax.io.raw import RawScenario, Reader
+
+if TYPE_CHECKING:
+    from spdm_jax.interplan.extras import InterplanExtras
+    from spdm_jax.interplan.reader import InterplanReader
+    from spdm_jax.io.nuplan_filter import ScenarioFilter
 
 AV2_POSES = "city_SE3_egovehicle.feather"
 """The file that every Argoverse 2 sensor log has."""
@@ -48,6 +54,19 @@ class Selection:
         return self._reader.read(token)
 
 
+class ChangedSelection(Selection):
+    """Some of interPlan's scenarios."""
+
+    def __init__(self, reader: "InterplanReader", limit: int | None):
+        """Picks the first scenarios; see `Selection`."""
+        super().__init__(reader, (), limit)
+        self._changed = reader
+
+    def read_with_extras(self, token: str) -> tuple[RawScenario, "InterplanExtras"]:
+        """Reads one scenario, changed; raises what the source's own reader raises."""
+        return self._changed.read_with_extras(token)
+
+
 def open_source(options: Pack) -> tuple[Reader, list[str]]:
     """Opens what the options name.
 
@@ -62,6 +81,9 @@ def open_source(options: Pack) -> tuple[Reader, list[str]]:
     _refuse_foreign_options(options, kind)
     notes: list[str] = []
     reader: Reader
+    if options.interplan is not None:
+        changed = _changed(options)
+        return ChangedSelection(changed, options.limit), list(changed.notes)
     if kind == "nuplan":
         from spdm_jax.io.nuplan import NuPlanReader
 
@@ -143,6 +165,7 @@ def _refuse_foreign_options(options: Pack, kind: Format) -> None:
     owner = {
         "maps": "nuplan",
         "filter": "nuplan",
+        "interplan": "nuplan",
         "type": "nuplan",
         "log": "nuplan",
         "stride": "av2",
@@ -156,7 +179,31 @@ def _refuse_foreign_options(options: Pack, kind: Format) -> None:
             )
 
 
-def _nuplan_filter(options: Pack):
+def _changed(options: Pack) -> "InterplanReader":
+    """Opens interPlan's scenarios.
+
+    Raises:
+      ValueError: a file cannot be used, or the options select no scenario.
+    """
+    from spdm_jax.interplan.modification_file import read_modifications
+    from spdm_jax.interplan.reader import InterplanReader
+
+    assert options.interplan is not None
+    config = read_modifications(options.interplan)
+    chosen = _nuplan_filter(options)
+    names = chosen.scenario_tokens or ()
+    # nuPlan's tags know nothing of the types that changes make.
+    if chosen.scenario_types is not None:
+        types = {name: config.changes(name).scenario_type for name in names if "-" in name}
+        if unknown := [name for name in chosen.scenario_types if name not in types.values()]:
+            known = ", ".join(sorted(set(types.values())))
+            raise ValueError(f"--type {unknown[0]}: no scenario of it; there are {known}")
+        names = [name for name in types if types[name] in chosen.scenario_types]
+        chosen = dataclasses.replace(chosen, scenario_tokens=names, scenario_types=None)
+    return InterplanReader(options.source, config, chosen, options.maps)
+
+
+def _nuplan_filter(options: Pack) -> "ScenarioFilter":
     from spdm_jax.io.nuplan_filter import ScenarioFilter
 
     chosen = ScenarioFilter.from_yaml(options.filter) if options.filter else ScenarioFilter()

@@ -6,6 +6,7 @@ packed scenario as a small JSON file.
 
 import dataclasses
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from spdm_jax.io.scenario_file import write_atomically
 EXTRAS_SUFFIX = ".interplan.json"
 """Of the file beside `<name>.npz`."""
 
+_CODED = re.compile(r"[0-9a-f]{16}-[a-z0-9]+")
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
 
@@ -72,6 +74,16 @@ class InterplanExtras:
     goal: Pose
     course: tuple[Point, ...]
     end: float
+
+
+def extras_path(scenario_file: Path) -> Path:
+    """Returns where the extras of a scenario file lie."""
+    return scenario_file.with_name(scenario_file.stem + EXTRAS_SUFFIX)
+
+
+def has_code(token: str) -> bool:
+    """Says whether a token names a changed scenario (`<token>-<code>`)."""
+    return _CODED.fullmatch(token) is not None
 
 
 def write_extras(path: Path | str, extras: InterplanExtras) -> None:

@@ -8,7 +8,7 @@ from spdm_jax.interplan.extras import InterplanExtras
 from spdm_jax.interplan.modify import modify
 from spdm_jax.io.map_query import MapQuery
 from spdm_jax.io.nuplan import NuPlanReader
-from spdm_jax.io.nuplan_filter import ScenarioFilter, Window, base_token
+from spdm_jax.io.nuplan_filter import SUFFIX_NOTE, ScenarioFilter, Window, base_token
 from spdm_jax.io.raw import RawScenario, ScenarioError
 
 INTERPLAN_WINDOW = Window(duration=30.0, offset=0.0)
@@ -42,7 +42,8 @@ class InterplanReader:
         *,
         window: Window = INTERPLAN_WINDOW,
     ) -> None:
-        names = [name for name in scenario_filter.scenario_tokens or () if "-" in name]
+        given = scenario_filter.scenario_tokens or ()
+        names = [name for name in given if "-" in name]
         if not names:
             raise ScenarioError(
                 "the filter names no changed scenario; give scenario_tokens as <token>-<code>"
@@ -52,7 +53,9 @@ class InterplanReader:
         found = set(self._reader.tokens())
         self._names = [name for name in self._changes if base_token(name) in found]
         self._queries: list[MapQuery] = []
-        self.notes = [*config.notes, *self._reader.notes]
+        # The reader below takes the suffixes for something that nobody follows.
+        recorded = [note for note in self._reader.notes if SUFFIX_NOTE not in note]
+        self.notes = [*config.notes, *recorded, *_left_out(given, self._names, config)]
 
     def tokens(self) -> Sequence[str]:
         """Returns the names of the scenarios that the logs hold, in the filter's order."""
@@ -85,3 +88,20 @@ class InterplanReader:
             query = MapQuery(raw.map)
             self._queries.append(query)
         return query
+
+
+def _left_out(given: Sequence[str], found: Sequence[str], config: InterplanConfig) -> list[str]:
+    """Says which scenarios are not what their names might promise."""
+    notes = []
+    if plain := [name for name in given if "-" not in name]:
+        notes.append(
+            f"{len(plain)} of {len(given)} scenario_tokens have no code and are left out, the "
+            f"first is {plain[0]}"
+        )
+    strange = [name for name in found if base_token(name) not in config.tokens]
+    if strange:
+        notes.append(
+            f"{config.source} says nothing about the tokens of {len(strange)} scenarios, the first "
+            f"is {strange[0]}: no goal positions and no added agents of their own"
+        )
+    return notes

@@ -58,7 +58,7 @@ class InterplanMetrics:
 
     Attributes:
       scores: by metric name; NaN where one could not be computed.
-      final: weighted score, NaN if a metric is.
+      final: weighted score, NaN if one of nuPlan's metrics is.
       lane_changes: to the goal.
       required_progress: share of the expert's way that gets past all obstacles, None without them.
     """
@@ -206,7 +206,7 @@ def weighted_score(scores: Mapping[str, float], scenario_type: str) -> float:
 
     Args:
       scores: by metric name: nuPlan's eight, `lane_changes_to_goal`, and that of the type's
-        obstacles.
+        obstacles. As published, lane changes that could not be counted (NaN) do not enter.
       scenario_type: interPlan's name.
 
     Source: interPlan `InterplanWeightedAverageMetricAggregator` and its configuration.
@@ -217,7 +217,8 @@ def weighted_score(scores: Mapping[str, float], scenario_type: str) -> float:
         multipliers.add(kind.value)
         if kind is not ObstacleKind.PEDESTRIANS:
             multipliers.remove(_DIRECTION)
-    averaged = [name for name in scores if name not in multipliers]
+    uncounted = {LANE_CHANGES} if np.isnan(scores[LANE_CHANGES]) else set()
+    averaged = [name for name in scores if name not in multipliers | uncounted]
     weights = [WEIGHTS.get(name, 1.0) for name in averaged]
     mean = np.average([scores[name] for name in averaged], weights=weights)
     return float(np.prod([scores[name] for name in multipliers]) * mean)

@@ -1,17 +1,17 @@
 """The extras of an interPlan scenario as the arrays that its simulation reads (host)."""
 
 import zlib
+from collections.abc import Sequence
 
 import numpy as np
 
 from spdm_jax.interplan.extras import InterplanExtras
 from spdm_jax.simulation.script import AgentPolicy, Script
-from spdm_jax.types import ScenarioInfo
 
 
 def script_of(
     extras: InterplanExtras,
-    info: ScenarioInfo,
+    track_ids: Sequence[str],
     origin: np.ndarray,
     *,
     num_tracks: int,
@@ -22,7 +22,7 @@ def script_of(
 
     Args:
       extras: of the scenario.
-      info: its description, for the rows of tracks.
+      track_ids: source ids of the scenario's tracks, row by row.
       origin: `[2]` map coordinates of the local frame's origin.
       num_tracks: A of the padded scenario.
       num_pedestrians: P.
@@ -33,13 +33,13 @@ def script_of(
     """
     waiting = [who for who in extras.pedestrians if who.begins_at is None]
     for name, count, room in (
-        ("tracks", len(info.track_ids), num_tracks),
+        ("tracks", len(track_ids), num_tracks),
         ("pedestrians", len(waiting), num_pedestrians),
         ("points of the course", len(extras.course), num_points),
     ):
         if count > room:
             raise ValueError(f"scenario {extras.name}: {count} {name} do not fit into {room}")
-    row_of = {track: row for row, track in enumerate(info.track_ids)}
+    row_of = {track: row for row, track in enumerate(track_ids)}
 
     def flags(tracks: tuple[str, ...]) -> np.ndarray:
         flagged = np.zeros(num_tracks, bool)

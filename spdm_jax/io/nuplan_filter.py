@@ -66,6 +66,8 @@ TAGGED_TYPES = frozenset(
     for name in (names.split() or [""])
 )
 """Scenario types that nuPlan's default mapping lists."""
+SUFFIX_NOTE = "tokens carry a suffix"
+"""Part of the note that a benchmark's variants are read unmodified."""
 
 _LISTS = ("scenario_types", "scenario_tokens", "log_names", "map_names")
 _NUMBERS = ("num_scenarios_per_type", "limit_total_scenarios", "timestamp_threshold_s")
@@ -287,7 +289,7 @@ def _from_entries(entries: Mapping[str, Any], source: str) -> ScenarioFilter:
     result = ScenarioFilter(**fields)
     if result.has_variants:
         notes.append(
-            f"{len(result.scenario_tokens or ())} tokens carry a suffix: the "
+            f"{len(result.scenario_tokens or ())} {SUFFIX_NOTE}: the "
             f"{len(result.base_tokens or ())} recorded scenarios are selected, unmodified, and "
             "num_scenarios_per_type is not applied"
         )

@@ -136,7 +136,13 @@ def test_weighted_score(scenario_type: str, changed: dict[str, float], expected:
 
 
 def test_unknown_metric_makes_the_score_unknown():
-    assert np.isnan(weighted_score(scores(lane_changes_to_goal=np.nan), "low_traffic_density"))
+    for name in ("ego_is_comfortable", "drivable_area_compliance"):
+        assert np.isnan(weighted_score(scores(**{name: np.nan}), "low_traffic_density"))
+
+
+def test_lane_changes_that_cannot_be_counted_do_not_enter():
+    changed = {"lane_changes_to_goal": np.nan, "ego_progress_along_expert_route": 0.0}
+    assert np.isclose(weighted_score(scores(**changed), "low_traffic_density"), 11 / 16)
 
 
 def extras(kind: ObstacleKind | None, scenario_type: str, *obstacles) -> InterplanExtras:

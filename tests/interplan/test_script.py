@@ -33,7 +33,7 @@ ROOM = {"num_tracks": 64, "num_pedestrians": 4, "num_points": 32}
 
 
 def script(dtype=jnp.float64) -> Script:
-    made = script_of(EXTRAS, INFO, SCENE.origin, **ROOM)
+    made = script_of(EXTRAS, INFO.track_ids, SCENE.origin, **ROOM)
     return jax.tree.map(lambda v: jnp.asarray(v, dtype if v.dtype == np.float64 else v.dtype), made)
 
 
@@ -51,13 +51,13 @@ def test_script():
 @pytest.mark.parametrize("name", list(ROOM))
 def test_script_needs_room(name: str):
     with pytest.raises(ValueError, match=f"{TOKEN}-s0: .* do not fit into 1"):
-        script_of(EXTRAS, INFO, SCENE.origin, **ROOM | {name: 1})
+        script_of(EXTRAS, INFO.track_ids, SCENE.origin, **ROOM | {name: 1})
 
 
 def test_script_needs_the_tracks():
     strange = dataclasses.replace(EXTRAS, stopped=("nobody",))
     with pytest.raises(ValueError, match="has no track \\['nobody'\\]"):
-        script_of(strange, INFO, SCENE.origin, **ROOM)
+        script_of(strange, INFO.track_ids, SCENE.origin, **ROOM)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
