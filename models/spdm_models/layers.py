@@ -156,7 +156,7 @@ class MultiheadAttention(nnx.Module):
           value: `[..., K, D]`.
           dropout: applied to the attention weights.
           valid: broadcastable to `[..., Q, K]`, True where the query may use the key.
-          bias: broadcastable to `[..., Q, K]`, added to the logits.
+          bias: broadcastable to `[..., heads, Q, K]`, added to the logits.
 
         Returns:
           `[..., Q, D]`.
@@ -169,7 +169,7 @@ class MultiheadAttention(nnx.Module):
         )
         logits = jnp.einsum("...qhd,...khd->...hqk", q / math.sqrt(q.shape[-1]), k)
         if bias is not None:
-            logits = logits + bias[..., None, :, :]
+            logits = logits + bias
         if valid is None:
             attention = jax.nn.softmax(logits)
         else:
