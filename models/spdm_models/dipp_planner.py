@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from spdm_jax.types import Array
-from spdm_models.gauss_newton import (
+
+from .gauss_newton import (
     GaussNewtonConfig,
     GaussNewtonSolution,
     gauss_newton,
@@ -63,6 +64,12 @@ class DIPPPlannerConfig:
             raise ValueError(
                 f"safety_steps {self.safety_steps} do not fit a horizon of {self.horizon} steps"
             )
+
+    @property
+    def num_residuals(self) -> int:
+        """Length of the weighted residual vector (383 at the reference's settings)."""
+        lane = self.horizon // self.lane_stride
+        return 6 * self.horizon - 2 + 3 * lane + len(self.safety_steps)
 
 
 class DIPPProblem(struct.PyTreeNode, kw_only=True):
