@@ -76,6 +76,10 @@ class Report:
             Row(file, array, 0.0, int(different.sum()), int(different.size), None, note)
         )
 
+    def not_compared(self, file, array, reason):
+        """Records that an array was left out, and why."""
+        self.rows.append(Row(file, array, note=f"not compared: {reason}"))
+
     def add_loader_row(self, file, row):
         """Takes over a row of the readers' own table; their discrete outputs must all agree."""
         tolerance = row.tolerance if not row.mismatches else -1.0

@@ -1,0 +1,102 @@
+"""What the checks of the learned models share: weights, relative tolerances, gradients."""
+
+import json
+import zlib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from spdm_models.params import Params
+from spdm_models.state_dict import Extras, flatten, from_state_dict
+
+LOSS_TOLERANCE = 1e-5
+"""Relative; the reference's own float32 error is 4e-7."""
+GRADIENT_TOLERANCE = 1e-3
+"""Of a tensor's largest entry, float32; the reference's own error is up to 1e-4."""
+EXACT_TOLERANCE = 1e-9
+"""Float64 against float64, relative to the largest entry."""
+
+
+def load_weights(path: Path, template: Params, extras: Extras, dtype) -> Params:
+    """Reads a state dict of a golden; every name and shape must fit."""
+    with np.load(path) as data:
+        state = {name: data[name] for name in data.files}
+    return from_state_dict(state, template, extras, path.name, dtype)
+
+
+def formula_weights(template: Params, seed: int, zero_rows: tuple[str, ...] = ()) -> dict:
+    """Returns the weights that need no file, by name.
+
+    Args:
+      template: names and shapes.
+      seed: of the recipe.
+      zero_rows: names whose row 0 is zero.
+    """
+    weights = {}
+    for name, leaf in flatten(template).items():
+        shape = leaf.shape
+        random = np.random.RandomState((zlib.crc32(name.encode()) ^ seed) & 0xFFFFFFFF)  # noqa: NPY002
+        u = random.uniform(-1, 1, size=shape)
+        if len(shape) >= 2:
+            value = u * np.sqrt(3 / shape[1])
+        elif name.endswith("weight"):
+            value = 1 + 0.1 * u
+        else:
+            value = 0.1 * u
+        weights[name] = value.astype(np.float32)
+    for name in zero_rows:
+        weights[name][0] = 0
+    return weights
+
+
+def check_recipe(report, file: str, weights: dict, data) -> None:
+    """Compares names, shapes and sums of formula weights with the golden's."""
+    names = [str(name) for name in data["param_names"]]
+    report.equal(file, "parameter names", sorted(weights) == sorted(names), True)
+    shapes = json.loads(str(data["param_shapes"])) if "param_shapes" in data.files else {}
+    same = all(tuple(shape) == weights[name].shape for name, shape in shapes.items())
+    report.equal(file, "parameter shapes", same, True)
+    sums = [weights[name].astype(np.float64).sum() for name in names]
+    report.close(file, "parameter sums", sums, data["param_sums"], 1e-9)
+
+
+def close_relative(report, file, array, ours, reference, tolerance, mask=None, note="") -> None:
+    """Compares with a tolerance in parts of the reference's largest entry (at least 1e-6)."""
+    reference = np.asarray(reference, float)
+    finite = np.abs(reference[np.isfinite(reference)])
+    largest = max(float(finite.max()) if finite.size else 0.0, 1e-6)
+    report.close(file, array, ours, reference, tolerance * largest, mask, note=note)
+
+
+def close_gradients(report, file, prefix: str, gradients: Params, data, tolerance: float) -> None:
+    """Compares the gradients that a golden holds under `prefix/` with ours.
+
+    Args:
+      report: takes one row per array.
+      file: name of the golden.
+      prefix: of the arrays in it; `grad` also reads norms from `gradnorm`.
+      gradients: like the weights.
+      data: the golden's arrays.
+      tolerance: of each tensor's largest entry.
+    """
+    flat = flatten(gradients)
+    for key in data.files:
+        if key.startswith(f"{prefix}/"):
+            name = key.removeprefix(f"{prefix}/")
+            close_relative(report, file, key, flat[name], data[key], tolerance)
+    norms = prefix[::-1].replace("grad"[::-1], "gradnorm"[::-1], 1)[::-1] + "/"
+    names = [key.removeprefix(norms) for key in data.files if key.startswith(norms)]
+    if names:
+        reference = np.array([float(data[norms + name]) for name in names])
+        ours = np.array([float(jnp.sqrt(jnp.sum(jnp.square(flat[name])))) for name in names])
+        # Norms that are zero but for rounding have no relative error.
+        floor = 1e-6 * np.sqrt(np.sum(reference**2))
+        relative = (ours - reference) / np.maximum(reference, floor)
+        report.close(file, norms + "*", relative, np.zeros_like(relative), tolerance)
+
+
+def arrays(data, prefix: str, names, dtype) -> dict[str, jax.Array]:
+    """Returns some of a golden's arrays on the device."""
+    return {name: jnp.asarray(data[prefix + name], dtype) for name in names}
