@@ -84,7 +84,7 @@ def _digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _processor() -> str:
+def processor() -> str:
     """Name of the processor."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
@@ -219,7 +219,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     facts = {
         "scale": scale,
         "code": _digest(),
-        "machine": _processor(),
+        "machine": processor(),
         "cores": usable_cores(),
         "platforms": os.environ.get("JAX_PLATFORMS", ""),
         "versions": {name: importlib.metadata.version(name) for name in VERSIONED},

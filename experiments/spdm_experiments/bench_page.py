@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from spdm_experiments.markdown import kept_part, markdown_table
+
 Row = Mapping[str, Any]
 
 MARKS_MS = {
@@ -56,9 +58,7 @@ def write_page(page: Path, about: Row, rows: Sequence[Row], apart: Mapping[str, 
     Returns:
       The files written.
     """
-    kept = f"{KEPT}\n"
-    if page.is_file() and KEPT in (before := page.read_text(encoding="utf-8")):
-        kept = before[before.index(KEPT) :]
+    kept = kept_part(page, KEPT)
     main = main_rows(rows)
     figure = page.with_name(f"{page.stem}_curves.svg")
     page.parent.mkdir(parents=True, exist_ok=True)
@@ -117,12 +117,11 @@ def _about(about: Row, rows: Sequence[Row]) -> str:
         "published reference is quoted: one thread of a machine of this class, where the "
         "yardstick took 29 ms.\n"
     )
-    return _table(["", "this page"], [[name, str(value)] for name, value in facts]) + "\n" + text
-
-
-def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return (
+        markdown_table(["", "this page"], [[name, str(value)] for name, value in facts])
+        + "\n"
+        + text
+    )
 
 
 def _marks(rows: Sequence[Row], apart: Mapping[str, Row]) -> str:
@@ -144,7 +143,7 @@ def _marks(rows: Sequence[Row], apart: Mapping[str, Row]) -> str:
     for words, mark, text, reached in _apart(apart):
         body.append([words, "", mark, text, "", "", reached])
     head = ["workload", "published reference", "to reach", "median / min"]
-    return _table([*head, "yardstick", "yardsticks", "reached"], body)
+    return markdown_table([*head, "yardstick", "yardsticks", "reached"], body)
 
 
 def _reached(value: float, mark: float) -> str:
@@ -190,7 +189,7 @@ def _columns(rows: Sequence[Row]) -> str:
             texts = [f"{c['median_ms']:.1f} / {c['min_ms']:.1f}" if c else "" for c in cells]
             body.append([words, *texts])
     head = ["workload", *(f"{precision}, {cores} core(s)" for precision, cores in cases)]
-    return _table(head, body)
+    return markdown_table(head, body)
 
 
 def _stages(rows: Sequence[Row]) -> str:
@@ -204,7 +203,7 @@ def _stages(rows: Sequence[Row]) -> str:
         [stage, *(f"{each[p]:.2f}" if p in each else "" for p in planners)]
         for stage, each in times.items()
     ]
-    return _table(["stage", *planners], body)
+    return markdown_table(["stage", *planners], body)
 
 
 def _every(rows: Sequence[Row]) -> str:
@@ -225,7 +224,7 @@ def _every(rows: Sequence[Row]) -> str:
                 ]
             )
     head = ["workload", "type, cores", "median ms", "min ms", "CPU ms", "yardstick ms", "first s"]
-    return _table([*head, *SHORT.values()], body)
+    return markdown_table([*head, *SHORT.values()], body)
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -39,7 +39,7 @@ _DPI = 300
 _LETTERS = 32
 """Letters of the small print per inch."""
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-_STYLE: Final[dict[Any, Any]] = {
+STYLE: Final[dict[Any, Any]] = {
     "font.size": 8.0,
     "font.family": ["DejaVu Sans"],  # comes with matplotlib: the same on every machine
     "axes.linewidth": 0.6,
@@ -67,14 +67,14 @@ _STYLE: Final[dict[Any, Any]] = {
 }
 
 
-def _styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
     """Gives a function's figure the look above, whatever the caller's settings are."""
 
     @functools.wraps(draw)
     def drawn(*args: Any, **settings: Any) -> Figure:
         import matplotlib
 
-        with matplotlib.rc_context(_STYLE):
+        with matplotlib.rc_context(STYLE):
             return draw(*args, **settings)
 
     return drawn
@@ -119,7 +119,7 @@ def write_figures(runs: Sequence[Run], folder: Path, *, seed: int = 0) -> list[P
     timed = any(len(stage_table(run)) for run in runs)  # those are always over N_p
     found = curves(runs, axis, seed)
     written = []
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figures = {
             f"score_over_{short}": plot_score(found, axis),
             f"runtime_over_{'np' if timed else short}": plot_runtime(runs, found, axis),
@@ -127,9 +127,9 @@ def write_figures(runs: Sequence[Run], folder: Path, *, seed: int = 0) -> list[P
         }
         for name, figure in figures.items():
             _footer(figure, runs)
-            _settle(figure)
+            settle(figure)
             for form in FORMATS:
-                written.append(_save(figure, folder / f"{name}.{form}"))
+                written.append(save(figure, folder / f"{name}.{form}"))
     return written
 
 
@@ -161,7 +161,7 @@ def curves(runs: Sequence[Run], axis: str, seed: int = 0) -> list[Curve]:
     return found
 
 
-@_styled
+@styled
 def plot_score(found: Sequence[Curve], axis: str = "num_proposals") -> Figure:
     """Draws the mean total score with its 95 % intervals.
 
@@ -169,7 +169,7 @@ def plot_score(found: Sequence[Curve], axis: str = "num_proposals") -> Figure:
       found: from `curves`.
       axis: the parameter below.
     """
-    figure = _figure(_COLUMN, 2.5)
+    figure = new_figure(_COLUMN, 2.5)
     axes = figure.subplots()
     _draw_curves(axes, found, "total")
     axes.set_xlabel(_math(axis_title(axis)))
@@ -178,7 +178,7 @@ def plot_score(found: Sequence[Curve], axis: str = "num_proposals") -> Figure:
     return figure
 
 
-@_styled
+@styled
 def plot_subscores(
     found: Sequence[Curve],
     axis: str = "num_proposals",
@@ -194,7 +194,7 @@ def plot_subscores(
     _, *terms = titles
     columns = 3 if len(terms) <= 6 else 4
     rows = -(-len(terms) // columns)
-    figure = _figure(2.1 * _COLUMN, 1.85 * rows)
+    figure = new_figure(2.1 * _COLUMN, 1.85 * rows)
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for panel, term in zip(panels.flat, terms, strict=False):
         _draw_curves(panel, found, term)
@@ -206,7 +206,7 @@ def plot_subscores(
     return figure
 
 
-@_styled
+@styled
 def plot_runtime(
     runs: Sequence[Run], found: Sequence[Curve], axis: str = "num_proposals"
 ) -> Figure:
@@ -226,7 +226,7 @@ def plot_runtime(
         for planner in table["planner"].unique(maintain_order=True)
     ]
     if not tables:
-        figure = _figure(_COLUMN, 2.5)
+        figure = new_figure(_COLUMN, 2.5)
         axes = figure.subplots()
         for curve in found:
             axes.plot(curve.values, [point.ms for point in curve.points], **_known(curve.look))
@@ -236,7 +236,7 @@ def plot_runtime(
         _places(axes, found)
         _legend(figure, axes, len(found), names=[curve.name for curve in found])
         return figure
-    figure = _figure(_COLUMN * max(1.0, 0.62 * len(tables)), 2.6)
+    figure = new_figure(_COLUMN * max(1.0, 0.62 * len(tables)), 2.6)
     shares = {"width_ratios": [len(table) + 0.5 for *_, table in tables]}  # bars of one width
     panels = figure.subplots(1, len(tables), sharey=True, squeeze=False, gridspec_kw=shares)[0]
     for axes, (_, name, table) in zip(panels, tables, strict=True):
@@ -258,7 +258,8 @@ def plot_runtime(
     return figure
 
 
-def _figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> Figure:
+    """Returns an empty figure, inches."""
     # A figure of its own instead of pyplot: no window system, nothing left open.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -333,7 +334,7 @@ def _math(text: str) -> str:
 
 def _footer(figure: Figure, runs: Sequence[Run]) -> None:
     """Says below the figure where its numbers come from."""
-    lines = []
+    texts = []
     for run, name in zip(runs, run_names(runs), strict=True):
         about = run.about
         most = max(len(run.usable(point)) for point in range(len(run.points)))
@@ -344,8 +345,14 @@ def _footer(figure: Figure, runs: Sequence[Run]) -> None:
             f"commit {about.get('commit') or 'unknown'}",
             str(about.get("device")),
         ]
-        text = ("" if len(runs) == 1 else f"{name}: ") + ", ".join(words)
-        lines += textwrap.wrap(text, int(_LETTERS * figure.get_figwidth()))
+        texts.append(("" if len(runs) == 1 else f"{name}: ") + ", ".join(words))
+    small_print(figure, texts)
+
+
+def small_print(figure: Figure, texts: Sequence[str]) -> None:
+    """Adds lines below a figure, wrapped to its width."""
+    width = int(_LETTERS * figure.get_figwidth())
+    lines = [line for text in texts for line in textwrap.wrap(text, width)]
     text = "\n".join(lines).replace("$", r"\$")
     # The room below is kept free by the layout, so that nothing is drawn over.
     room = 0.085 * len(lines) + 0.03
@@ -357,7 +364,7 @@ def _footer(figure: Figure, runs: Sequence[Run]) -> None:
     figure.text(0.01, 0.02 / height, text, fontsize=4.6, color="#6b7480", va="bottom", ha="left")
 
 
-def _settle(figure: Figure) -> None:
+def settle(figure: Figure) -> None:
     """Lays a figure out once, so that it is the same in every format and at every time.
 
     The layout's solver does not repeat its last bits, and SVG names are made from all of them.
@@ -369,7 +376,8 @@ def _settle(figure: Figure) -> None:
         axes.set_position((left, bottom, width, height))
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path) -> Path:
+    """Writes a figure in the format that the name ends in; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     # No date inside: the same rows give the same file.
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[path.suffix[1:]]
