@@ -88,6 +88,7 @@ def record(
     scenario_type: str,
     log_name: str = "synthetic",
     num_iterations: int = NUM_ITERATIONS,
+    num_steps: int = NUM_STEPS,
 ) -> RawScenario:
     """Draws place and direction of a scene, sets its stage and records what happens on it.
 
@@ -98,11 +99,12 @@ def record(
       scenario_type: likewise.
       log_name: likewise.
       num_iterations: likewise.
+      num_steps: recorded steps in all.
     """
     angle = rng.uniform(-np.pi, np.pi)
     origin = np.array(ORIGIN) + np.round(rng.uniform(-2000.0, 2000.0, 2), 1)
     stage = scene(rng)
-    ego, tracks = simulate(stage.ego, stage.followers, stage.scripted, stage.lights, rng)
+    ego, tracks = simulate(stage.ego, stage.followers, stage.scripted, stage.lights, rng, num_steps)
     goal = stage.builder.lanes[stage.route[-1]].centerline[-1]
 
     frame = _Frame(float(angle), origin)
@@ -115,13 +117,13 @@ def record(
         scenario_type=scenario_type,
         source="synthetic",
         map=frame.map(stage.builder.build()),
-        time_us=START_TIME_US + STEP_US * (np.arange(NUM_STEPS, dtype=np.int64) - NUM_HISTORY),
+        time_us=START_TIME_US + STEP_US * (np.arange(num_steps, dtype=np.int64) - NUM_HISTORY),
         num_history=NUM_HISTORY,
         num_iterations=num_iterations,
         ego=np.column_stack([frame.poses(ego[:, :3]), ego[:, 3:]]),
-        ego_valid=np.ones(NUM_STEPS, dtype=bool),
+        ego_valid=np.ones(num_steps, dtype=bool),
         tracks=frame.tracks(tracks),
-        lights=[{i: int(s[k]) for i, s in lights.items()} for k in range(NUM_STEPS)],
+        lights=[{i: int(s[k]) for i, s in lights.items()} for k in range(num_steps)],
         route_roadblocks=list(dict.fromkeys(roadblocks)),
         mission_goal=frame.poses(goal),
     )

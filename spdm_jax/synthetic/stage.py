@@ -9,7 +9,7 @@ from spdm_jax.config import DT
 from spdm_jax.io.raw import RawArea
 from spdm_jax.synthetic.paths import Path
 from spdm_jax.synthetic.roads import LANE_WIDTH, MARGIN, MapBuilder, add_corridor, strip
-from spdm_jax.synthetic.traffic import NUM_HISTORY, NUM_STEPS, Follower, Scripted
+from spdm_jax.synthetic.traffic import MAX_STEPS, NUM_HISTORY, Follower, Scripted
 from spdm_jax.types import LightStatus, ObjectType
 
 EGO_STATION = 60.0
@@ -208,10 +208,10 @@ def gates_of(
 
 
 def light_phases(phases: Sequence[tuple[float, LightStatus]]) -> np.ndarray:
-    """Returns `[T]` statuses from (start in s relative to iteration 0, status) pairs in order.
+    """Returns `[MAX_STEPS]` statuses from pairs in order: start, s after iteration 0, and status.
 
     The first status also holds before its start.
     """
-    time = (np.arange(NUM_STEPS) - NUM_HISTORY) * DT
+    time = (np.arange(MAX_STEPS) - NUM_HISTORY) * DT
     row = np.searchsorted([start for start, _ in phases[1:]], time + 1e-9, side="right")
     return np.array([status for _, status in phases], dtype=np.int8)[row]

@@ -52,7 +52,7 @@ def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: f
     speed = rng.uniform(0.62, 0.72) * limit
     begin = EGO_STATION + rng.uniform(4.0, 12.0)
     done = begin + 4.5 * speed
-    end = done + EGO_FRONT + rng.uniform(5.0, 20.0)
+    end = done + EGO_FRONT + rng.uniform(4.0, 10.0)
     goal = int(rng.integers(2))
     path = Path.from_curvature([(end, rng.uniform(-1.0, 1.0) / 400.0), (500.0, 0.0)])
     builder = MapBuilder("synthetic")
@@ -93,7 +93,7 @@ def lane_change(rng: np.random.Generator, spacing: tuple[float, float], limit: f
 def construction_zone(rng: np.random.Generator) -> Stage:
     """Cones and barriers close the ego's lane of two; the expert passes them on the other one."""
     stage, path, speed = _two_lanes(rng)
-    begin, length = FRONT + rng.uniform(56.0, 72.0), rng.uniform(18.0, 28.0)
+    begin, length = FRONT + rng.uniform(46.0, 58.0), rng.uniform(18.0, 28.0)
     own = stage.ego.path
     edge = LANE_WIDTH / 2
     for k, left in enumerate(np.linspace(-edge + 0.2, edge - 0.8, 6)):
@@ -114,7 +114,7 @@ def construction_zone(rng: np.random.Generator) -> Stage:
 def crashed_cars(rng: np.random.Generator) -> Stage:
     """Two cars have crashed on the ego's lane of two; the other one is free."""
     stage, path, speed = _two_lanes(rng)
-    begin = FRONT + rng.uniform(58.0, 74.0)
+    begin = FRONT + rng.uniform(46.0, 58.0)
     own = stage.ego.path
     for station, turn in ((begin + 2.5, rng.uniform(0.3, 0.7)), (begin + 7.5, -0.4)):
         size = (rng.uniform(4.2, 4.8), 1.85)

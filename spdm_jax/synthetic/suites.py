@@ -1,8 +1,10 @@
 """Built-in suites: fixed, seeded collections of scenes with an expert's record.
 
 `common-14` has fourteen everyday situations, `interactive-8` eight in which following a lane does
-not do. Every scene covers a closed-loop run of 15 s: 2.2 s of history, 151 iterations, and 8 s
-beyond each iteration at which a planner is asked.
+not do. Every scene covers a closed-loop run of 15 s in `common-14` and of 30 s in `interactive-8`,
+as in the benchmarks whose situations they take up: 2.2 s of history, 151 or 301 iterations, and 8 s
+beyond each iteration at which a planner is asked. In 30 s, standing before what blocks the lane
+costs the progress that nuPlan's score demands.
 
 The record is an expert's by hindsight: a scene is drawn anew, with the next of its seeds, until
 the recorded ego drives faultlessly (`spdm_jax.synthetic.hindsight`).
@@ -19,9 +21,12 @@ from spdm_jax.synthetic.hindsight import faults
 from spdm_jax.synthetic.stage import Stage
 from spdm_jax.synthetic.suite_common import COMMON
 from spdm_jax.synthetic.suite_interactive import INTERACTIVE
+from spdm_jax.synthetic.traffic import NUM_HISTORY
 
-NUM_ITERATIONS = 151
-"""Iterations of a scene: 15 s with both ends."""
+NUM_ITERATIONS = {"common-14": 151, "interactive-8": 301}
+"""Iterations of a scene of each suite: 15 and 30 s with both ends."""
+NUM_BEYOND = 80
+"""Recorded steps beyond the last iteration at which a planner is asked: 8 s."""
 SCENES_PER_TYPE = 10
 MAX_DRAWS = 40
 """A scene type that needs more draws for a faultless record is broken."""
@@ -75,6 +80,7 @@ class SuiteReader:
                 f"with a type of the suite (such as {next(iter(self._scenes), None)!r})"
             )
         scenario_type, number = self._scenes[token]
+        num_iterations = NUM_ITERATIONS[self._suite]
         key = zlib.crc32(f"{self._suite}/{scenario_type}".encode())
         for draw in range(MAX_DRAWS):
             raw = record(
@@ -83,7 +89,8 @@ class SuiteReader:
                 token=token,
                 scenario_type=scenario_type,
                 log_name=self._suite,
-                num_iterations=NUM_ITERATIONS,
+                num_iterations=num_iterations,
+                num_steps=NUM_HISTORY + num_iterations - 1 + NUM_BEYOND,
             )
             if not faults(raw):
                 return raw

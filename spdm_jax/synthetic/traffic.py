@@ -22,7 +22,9 @@ NUM_HISTORY = 22
 NUM_ITERATIONS = 150
 """Steps of the scenario's own window."""
 NUM_STEPS = NUM_HISTORY + NUM_ITERATIONS + 80
-"""All recorded steps: history, window and 8 s beyond it."""
+"""Recorded steps of a scene: history, window and 8 s beyond it."""
+MAX_STEPS = NUM_HISTORY + 300 + 80
+"""Recorded steps of the longest scenes."""
 
 EGO = VehicleParams()
 EGO_FRONT = float(EGO.rear_axle_to_center) + float(EGO.length) / 2
@@ -117,6 +119,7 @@ def simulate(
     scripted: Sequence[Scripted],
     lights: dict[str, np.ndarray],
     rng: np.random.Generator,
+    num_steps: int = NUM_STEPS,
 ) -> tuple[np.ndarray, RawTracks]:
     """Runs the traffic of one scene.
 
@@ -125,16 +128,17 @@ def simulate(
         library's.
       followers: vehicles and bicycles.
       scripted: pedestrians and static objects.
-      lights: connector -> `[T]` `LightStatus`.
+      lights: connector -> `[T]` `LightStatus`, at least as long as the run.
       rng: source of the drivers' imperfection.
+      num_steps: T, recorded steps.
 
     Returns:
       The ego's `[T, 11]` states in nuPlan's column order, and the tracks (order of first
       appearance; objects never within range of the ego are left out).
     """
-    traffic = _Traffic(ego, followers, scripted, lights)
+    traffic = _Traffic(ego, followers, scripted, lights, num_steps)
     noise = np.zeros(len(traffic.drivers))
-    for step in range(NUM_HISTORY, NUM_STEPS):
+    for step in range(NUM_HISTORY, num_steps):
         # The drivers' attention drifts; the recorded ego's does not.
         noise = 0.9 * noise + 0.05 * rng.standard_normal(len(noise))
         noise[0] = 0.0
@@ -151,7 +155,9 @@ class _Traffic:
         followers: Sequence[Follower],
         scripted: Sequence[Scripted],
         lights: dict[str, np.ndarray],
+        num_steps: int,
     ):
+        self.num_steps = num_steps
         self.drivers = [ego, *followers]
         self.lights = lights
         self.network = PathNetwork([d.path for d in self.drivers])
@@ -166,17 +172,17 @@ class _Traffic:
         self.to_center = np.zeros(len(self.drivers))
         self.to_center[0] = float(EGO.rear_axle_to_center)
 
-        time = (np.arange(NUM_STEPS) - NUM_HISTORY) * DT
+        time = (np.arange(num_steps) - NUM_HISTORY) * DT
         walks = [s.poses(time) for s in scripted]
-        self.script_pose = np.array([p for p, _ in walks]).reshape(-1, NUM_STEPS, 3)
-        self.script_speed = np.array([v for _, v in walks]).reshape(-1, NUM_STEPS)
+        self.script_pose = np.array([p for p, _ in walks]).reshape(-1, num_steps, 3)
+        self.script_speed = np.array([v for _, v in walks]).reshape(-1, num_steps)
         self.script_half = np.array([s.size for s in scripted]).reshape(-1, 2) / 2
         seen = self.network.view(
-            self.script_pose.reshape(-1, 3), np.repeat(self.script_half, NUM_STEPS, axis=0)
+            self.script_pose.reshape(-1, 3), np.repeat(self.script_half, num_steps, axis=0)
         )
-        self.script_view = seen.reshape(len(self.network.length), len(scripted), NUM_STEPS)
+        self.script_view = seen.reshape(len(self.network.length), len(scripted), num_steps)
 
-        self.station = np.zeros((len(self.drivers), NUM_STEPS))
+        self.station = np.zeros((len(self.drivers), num_steps))
         self.speed, self.accel = np.zeros_like(self.station), np.zeros_like(self.station)
         past = slice(0, NUM_HISTORY + 1)
         self.speed[:, past] = np.array([[d.speed] for d in self.drivers])
@@ -199,7 +205,7 @@ class _Traffic:
         # Nobody rolls backwards: the last braking step ends at speed zero.
         accel = np.maximum(accel, -speed / DT)
         self.accel[:, step] = accel
-        if step + 1 < NUM_STEPS:
+        if step + 1 < self.num_steps:
             self.station[:, step + 1] = station + DT * speed + 0.5 * DT**2 * accel
             self.speed[:, step + 1] = np.maximum(speed + DT * accel, 0.0)
 
@@ -237,7 +243,7 @@ class _Traffic:
 
         Drivers who can no longer stop before the conflict drive on.
         """
-        later = np.minimum(step + LOOKAHEAD_STEPS, NUM_STEPS - 1)
+        later = np.minimum(step + LOOKAHEAD_STEPS, self.num_steps - 1)
         moving = np.flatnonzero(np.any(self.script_speed[:, later] > 0.0, axis=1))
         if not moving.size:
             return np.zeros(len(self.drivers))
@@ -325,7 +331,7 @@ class _Traffic:
     def ego_states(self) -> np.ndarray:
         """Returns `[T, 11]` states of the ego, whose steering follows from its path."""
         station, speed = self.station[0], self.speed[0]
-        row = np.zeros(NUM_STEPS, dtype=int)
+        row = np.zeros(self.num_steps, dtype=int)
         pose = self.network.pose(row, station)
         # Curvature from the heading over one metre of the path, defined at standstill too.
         ahead = self.network.pose(row, station + 0.5)[:, 2]
