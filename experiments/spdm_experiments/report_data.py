@@ -201,7 +201,7 @@ def common_terms(runs: Sequence[Run]) -> Terms:
 def bootstrap(values: np.ndarray, seed: int) -> np.ndarray:
     """Returns 95 % intervals of the means over rows: percentiles of means of resampled rows.
 
-    All columns see the same resamples.
+    All columns see the same resamples. NaN is no value: a column's mean is over its others.
 
     Args:
       values: `[N, K]`.
@@ -214,6 +214,8 @@ def bootstrap(values: np.ndarray, seed: int) -> np.ndarray:
     if count < 2:
         return np.full((2, columns), np.nan)
     generator = np.random.default_rng(seed)
+    known = np.isfinite(values)
+    filled = np.where(known, values, 0)
     means = np.empty((RESAMPLES, columns))
     step = max(1, _BLOCK // count)
     for start in range(0, RESAMPLES, step):
@@ -222,8 +224,19 @@ def bootstrap(values: np.ndarray, seed: int) -> np.ndarray:
         picked += count * np.arange(size)[:, None]
         # How often each row was drawn, so that a matrix product gives all columns' means.
         drawn = np.bincount(picked.ravel(), minlength=size * count).reshape(size, count)
-        means[start : start + size] = drawn @ values / count
-    return np.quantile(means, (0.025, 0.975), axis=0)
+        with np.errstate(invalid="ignore"):  # a resample may miss all values of a rare column
+            means[start : start + size] = drawn @ filled / (drawn @ known)
+    if known.all():
+        return np.quantile(means, (0.025, 0.975), axis=0)
+    return _quantiles(means, known.sum(axis=0))
+
+
+def _quantiles(means: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Intervals of columns `[R, K]` that lack values; NaN where fewer than two are known `[K]`."""
+    ends = np.full((2, len(known)), np.nan)
+    for column in np.flatnonzero(known >= 2):
+        ends[:, column] = np.nanquantile(means[:, column], (0.025, 0.975))
+    return ends
 
 
 def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
@@ -234,13 +247,14 @@ def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
         good = run.usable(point)
         values = good.select(polars.col(names).cast(polars.Float64)).to_numpy()
         ends = [(low, high) for low, high in bootstrap(values, seed).T.tolist()]
-        means = values.mean(axis=0) if len(values) else np.full(len(names), np.nan)
+        columns = (column[np.isfinite(column)] for column in values.T)
+        means = [float(column.mean()) if len(column) else np.nan for column in columns]
         found.append(
             PointSummary(
                 point=point,
                 scenarios=len(good),
                 failed=len(run.rows.filter(polars.col("point") == point)) - len(good),
-                means=dict(zip(names, means.tolist(), strict=True)),
+                means=dict(zip(names, means, strict=True)),
                 intervals=dict(zip(names, ends, strict=True)),
                 braking=_mean(good, "emergency_brake"),
                 ms=_mean(good, "run_ms"),

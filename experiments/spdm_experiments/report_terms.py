@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from spdm_experiments.simulate_terms import CLOSED, OPEN
+from spdm_experiments.simulate_terms import CLOSED, INTERPLAN, OPEN
 
 TERMS: Final = {
     "total": "Total score",
@@ -84,6 +84,8 @@ def terms_of(about: Mapping[str, Any]) -> Terms:
         raise ValueError(about.get("command"))
     modes = {point["mode"] for point in about["points"]}
     shown = {**(CLOSED if "closed" in modes else {}), **(OPEN if "open" in modes else {})}
+    if about.get("num_interplan"):
+        shown |= INTERPLAN
     return Terms(
         command="simulate",
         title="Simulation report",

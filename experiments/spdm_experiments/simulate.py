@@ -17,7 +17,8 @@ from spdm_experiments.sequence import go_on
 from spdm_experiments.simulate_points import Point, make_points
 from spdm_experiments.simulate_rows import METRICS
 from spdm_experiments.simulate_scenes import Scenes, find_scenes
-from spdm_experiments.simulate_terms import SHORT, TITLES
+from spdm_experiments.simulate_scripts import Extras, ScriptRoom, check_points, room_of
+from spdm_experiments.simulate_terms import INTERPLAN, SHORT, TITLES
 from spdm_experiments.simulate_work import SimulateJob
 from spdm_experiments.tables import console
 from spdm_experiments.work import Group
@@ -40,6 +41,7 @@ def run_simulate(options: Simulate) -> bool:
         raise ValueError(f"--replan-every is {options.replan_every}; it must be at least 1")
     points = make_points(options)
     scenes = find_scenes(options)
+    check_points(scenes.extras, points)
     return go_on(SimulateRun(options, scenes, points), scenes.inventory, shard)
 
 
@@ -49,32 +51,36 @@ class SimulateRun(GridRun):
     def __init__(self, options: Simulate, scenes: Scenes, points: Sequence[Point]):
         """Puts it together; see `GridRun`."""
         workers = workers_of(options)
-        shapes = list(_shapes(options, scenes.inventory.entries, workers))
+        shapes = list(_shapes(options, scenes.inventory.entries, scenes.extras, workers))
         job = SimulateJob(
             folder=options.out,
             points=[point.entry(number) for number, point in enumerate(points)],
-            groups=[group for group, _ in shapes],
+            groups=[group for group, _, _ in shapes],
             precision=options.precision,
             batching=BatchConfig(),
             arrays=None if options.record == "none" else "histories",
             runs=list(points),
             replan_every=options.replan_every,
             plans=options.record == "plans",
+            extras=scenes.extras,
+            rooms=[room for _, room, _ in shapes],
         )
         about = {
             "command": "simulate",
             "suite": scenes.suite,
             "scenes": str(scenes.folder),
             "seed": options.seed,
+            "num_interplan": len(scenes.extras),
             "config": {
                 "replan_every": options.replan_every,
                 "record": options.record,
                 "types": list(options.types),
             },
         }
-        members = [entries for _, entries in shapes]
+        members = [entries for _, _, entries in shapes]
         super().__init__(options, scenes.inventory, job, members, workers, about)
         self._seed, self._by_type = options.seed, options.by_type
+        self._changed = list(scenes.extras)
 
     def tell(self) -> None:
         """Prints a line per point, and one per type of scenario if asked to."""
@@ -82,15 +88,30 @@ class SimulateRun(GridRun):
         for mode in METRICS:
             numbers = [n for n, point in enumerate(self.job.points) if point["mode"] == mode]
             if numbers:
-                console().print(self._table(rows, numbers, mode))
+                title = f"{self.folder}, {mode} loop"
+                console().print(self._table(rows, numbers, title, "score", METRICS[mode]))
+        changed = rows.filter(polars.col("token").is_in(self._changed))
+        if self._changed:
+            title, (score, *metrics) = f"{self.folder}, scored by interPlan", INTERPLAN
+            console().print(
+                self._table(changed, range(len(self.job.points)), title, score, metrics)
+            )
         if self._by_type:
-            console().print(self._type_table(rows))
+            console().print(self._type_table(rows, "score"))
+            if self._changed:
+                console().print(self._type_table(changed, "interplan_score"))
 
-    def _table(self, rows: polars.DataFrame, numbers: Sequence[int], mode: str) -> Table:
-        """Means of one mode over the scenarios that are "ok"."""
-        metrics = METRICS[mode]
+    def _table(
+        self,
+        rows: polars.DataFrame,
+        numbers: Sequence[int],
+        title: str,
+        score: str,
+        metrics: Sequence[str],
+    ) -> Table:
+        """Means over the scenarios that are "ok"; what a row lacks does not count."""
         table = Table(
-            title=f"{self.folder}, {mode} loop",
+            title=title,
             caption=", ".join(f"{SHORT[name]} {TITLES[name].lower()}" for name in metrics),
             title_justify="left",
             caption_justify="left",
@@ -105,9 +126,10 @@ class SimulateRun(GridRun):
         for number in numbers:
             mine = rows.filter(polars.col("point") == number)
             good = mine.filter(polars.col("status") == "ok")
-            values = good.select(polars.col("score", *metrics).cast(polars.Float64)).to_numpy()
+            values = good.select(polars.col(score, *metrics).cast(polars.Float64)).to_numpy()
             low, high = bootstrap(values[:, :1], self._seed)[:, 0]
-            means = values.mean(axis=0) if len(values) else np.full(1 + len(metrics), np.nan)
+            means = [column[np.isfinite(column)] for column in values.T]
+            means = [column.mean() if len(column) else np.nan for column in means]
             about = self.layout.point(number)
             table.add_row(
                 *(_plain(about[name]) for name in names),
@@ -119,9 +141,10 @@ class SimulateRun(GridRun):
             )
         return table
 
-    def _type_table(self, rows: polars.DataFrame) -> Table:
-        """Mean scores of each scenario type, a column per point."""
-        table = Table(title="Mean score by scenario type", title_justify="left", box=SIMPLE_HEAD)
+    def _type_table(self, rows: polars.DataFrame, score: str) -> Table:
+        """Means of a score over each scenario type, a column per point."""
+        title = f"Mean {score} by scenario type"
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
         table.add_column("type", no_wrap=True)
         table.add_column("scenes", justify="right")
         shown = [name for name in distinguishing(self.job.points) if name != "point"]
@@ -131,7 +154,7 @@ class SimulateRun(GridRun):
         for (kind,), mine in good.sort("scenario_type").group_by(
             "scenario_type", maintain_order=True
         ):
-            means = dict(mine.group_by("point").agg(polars.col("score").mean()).iter_rows())
+            means = dict(mine.group_by("point").agg(polars.col(score).mean()).iter_rows())
             cells = [means.get(number) for number in range(len(self.job.points))]
             texts = ("" if mean is None else _text(mean, 4) for mean in cells)
             table.add_row(str(kind), str(mine["token"].n_unique()), *texts)
@@ -147,13 +170,14 @@ def _plain(value: Any) -> str:
 
 
 def _shapes(
-    options: Simulate, entries: Sequence[Entry], workers: Workers
-) -> Iterator[tuple[Group, list[Entry]]]:
-    """Yields the scenarios of one shape and one length, which share a program."""
+    options: Simulate, entries: Sequence[Entry], extras: Extras, workers: Workers
+) -> Iterator[tuple[Group, ScriptRoom | None, list[Entry]]]:
+    """Yields the scenarios of one shape and length, scripted or not, which share a program."""
+    kind_of = lambda entry: (entry.num_iterations, entry.token in extras)
     for shape in group_by_shape([entry.sizes for entry in entries]):
         mine = [entries[row] for row in shape.rows]
-        for count in sorted({entry.num_iterations for entry in mine}):
-            members = [entry for entry in mine if entry.num_iterations == count]
+        for count, scripted in sorted({kind_of(entry) for entry in mine}):
+            members = [entry for entry in mine if kind_of(entry) == (count, scripted)]
             largest = CPU_CHUNK if workers.kind == "cpu" else MAX_CHUNK
             group = group_of(
                 options,
@@ -163,4 +187,5 @@ def _shapes(
                 largest=largest,
                 num_iterations=count,
             )
-            yield group, members
+            room = room_of([extras[entry.token] for entry in members]) if scripted else None
+            yield group, room, members

@@ -10,6 +10,8 @@ import polars
 from spdm_experiments.inventory import Entry
 from spdm_experiments.rows import POINT, REAL, TEXT, WHOLE, Layout, identity
 from spdm_experiments.simulate_scene import Result
+from spdm_experiments.simulate_terms import INTERPLAN
+from spdm_jax.interplan.score import LANE_CHANGES, InterplanMetrics
 from spdm_jax.metrics import OPEN_LOOP_SCORED, SCORED
 from spdm_jax.metrics.named import LostPoint, lost_points
 from spdm_jax.types import ObjectType
@@ -31,7 +33,7 @@ LOST = polars.List(
 )
 VALUES = {
     "score": REAL,
-    **dict.fromkeys((*SCORED, *OPEN_LOOP_SCORED), REAL),
+    **dict.fromkeys((*SCORED, *OPEN_LOOP_SCORED, *INTERPLAN), REAL),
     "progress_m": REAL,
     "expert_progress_m": REAL,
     "mean_speed": REAL,
@@ -73,6 +75,7 @@ def result_rows(
     result: Result,
     point: int,
     run_ms: float,
+    verdicts: Sequence[InterplanMetrics] | None = None,
 ) -> list[dict[str, Any]]:
     """Returns the rows of one point.
 
@@ -84,6 +87,7 @@ def result_rows(
       result: NumPy leaves `[B, ...]`.
       point: number of the point.
       run_ms: of one scenario.
+      verdicts: `[B]` interPlan's, None for scenarios without extras.
     """
     about = layout.point(point)
     rows = []
@@ -97,6 +101,9 @@ def result_rows(
             row |= _scores(one, about["mode"])
             if about["mode"] == "closed":
                 row |= _closed(one, track_ids[i], kinds[i])
+                if verdicts is not None:
+                    row |= _changed(verdicts[i])
+                    row["lost"] += _lost_by_changes(verdicts[i], row)
             else:
                 row |= {"ade": float(one.metrics.mean[0]), "fde": float(one.metrics.mean[1])}
         rows.append(row)
@@ -155,6 +162,36 @@ def _closed(one: Result, track_ids: Sequence[str], kinds: np.ndarray) -> dict[st
             for point in lost
         ],
     }
+
+
+def _changed(verdict: InterplanMetrics) -> dict[str, Any]:
+    """interPlan's columns; a metric that could not be computed is null."""
+    scores = {"interplan_score": verdict.final, **verdict.scores}
+    known = lambda name: name in scores and np.isfinite(scores[name])
+    return {name: float(scores[name]) if known(name) else None for name in INTERPLAN}
+
+
+def _lost_by_changes(verdict: InterplanMetrics, row: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What cost points of interPlan's score alone."""
+    changes, found = verdict.lane_changes, {}
+    if changes.score < 1:
+        count = lambda value: "unknown" if value is None else str(value)
+        found[LANE_CHANGES] = (
+            f"lane changes to the goal: {count(changes.at_start)} at the start, "
+            f"{count(changes.at_end)} left at the end"
+        )
+    ratio = row["ego_progress_along_expert_route"]
+    for name in INTERPLAN:
+        if name.startswith("ego_sorts") and row[name] == 0:
+            found[name] = (
+                f"stays behind: progress {ratio:.2f} of the {verdict.required_progress:.2f} that "
+                "it takes"
+            )
+    none = {"time": None, "object": None, "object_type": None}
+    return [
+        {"metric": name, "score": verdict.scores[name], "detail": detail, **none}
+        for name, detail in found.items()
+    ]
 
 
 def histories_of(

@@ -13,6 +13,7 @@ from flax import struct
 
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.decision import cast_params
+from spdm_jax.interplan.score import expert_route
 from spdm_jax.metrics import (
     ClosedLoopMetrics,
     Expert,
@@ -34,6 +35,7 @@ from spdm_jax.simulation.history import History
 from spdm_jax.simulation.idm_driver import idm_driver
 from spdm_jax.simulation.loop import SimulationConfig, SimulationParams, simulate
 from spdm_jax.simulation.mobil_driver import mobil_driver
+from spdm_jax.simulation.script import Script
 from spdm_jax.types import Array, Scenario
 
 UNREAD = ("map.crosswalks", "map.walkways")
@@ -77,7 +79,9 @@ class Result(struct.PyTreeNode, kw_only=True):
     """One finished run.
 
     Attributes:
-      metrics: closed-loop or open-loop metrics; the routes are left out.
+      metrics: closed-loop or open-loop metrics; routes are left out, but the ego's of a scripted
+        run.
+      expert_lanes: `[T, L]` bool, `expert_route` of a scripted run, else None.
       time: `[T]` s of the samples.
       samples: `[]` int32, how many of them are real.
       failed: `[]` bool, the planner returned a number that is not finite.
@@ -88,6 +92,7 @@ class Result(struct.PyTreeNode, kw_only=True):
     """
 
     metrics: ClosedLoopMetrics | OpenLoopMetrics
+    expert_lanes: Array | None
     time: Array
     samples: Array
     failed: Array
@@ -112,26 +117,33 @@ def make_driver(params: PlannerParams, static: Switches) -> Driver:
     raise ValueError(f"no planner {static.planner!r}")
 
 
-def run_scene(scene: Scenario, mine: None, shared: PlannerParams, static: Switches) -> Result:
+def run_scene(
+    scene: Scenario, mine: Script | None, shared: PlannerParams, static: Switches
+) -> Result:
     """Simulates one scenario and judges the run.
 
     Args:
       scene: one scenario on the device, of `static.num_iterations` iterations.
-      mine: nothing.
+      mine: script of an interPlan scenario, else None.
       shared: traced settings of PDM-Closed and SPDM; the other planners do not read them.
       static: static settings.
     """
     driver = make_driver(cast_params(shared, scene.ego.x.dtype), static)
-    run = simulate(scene, driver, SimulationParams(), static.simulation)
+    run = simulate(scene, driver, SimulationParams(), static.simulation, script=mine)
+    expert_lanes = None
     if static.simulation.ego == "log":
         metrics, short = _open_loop(scene, run.plans, static.num_iterations)
     else:
-        metrics, short = _closed_loop(scene, run.history, static.num_iterations), jnp.bool_(False)
+        expert, short = _expert(scene, static.num_iterations), jnp.bool_(False)
+        metrics = _closed_loop(scene, run.history, expert, keep_route=mine is not None)
+        if mine is not None:
+            expert_lanes = expert_route(scene.map, expert, run.history.valid)
     kept = None
     if static.record:
         kept = Kept(history=run.history, plans=_shown(run.plans))
     return Result(
         metrics=metrics,
+        expert_lanes=expert_lanes,
         time=run.history.time,
         samples=jnp.sum(run.history.valid, dtype=jnp.int32),
         failed=run.failed,
@@ -142,15 +154,21 @@ def run_scene(scene: Scenario, mine: None, shared: PlannerParams, static: Switch
     )
 
 
-def _closed_loop(scene: Scenario, history: History, num_iterations: int) -> ClosedLoopMetrics:
+def _expert(scene: Scenario, num_iterations: int) -> Expert:
     at = scene.num_history + jnp.arange(num_iterations)
     pick = lambda values: values[jnp.minimum(at, values.shape[0] - 1)]
-    expert = Expert(jax.tree.map(pick, scene.ego), pick(scene.ego_valid))
+    return Expert(jax.tree.map(pick, scene.ego), pick(scene.ego_valid))
+
+
+def _closed_loop(
+    scene: Scenario, history: History, expert: Expert, *, keep_route: bool
+) -> ClosedLoopMetrics:
     metrics = closed_loop(history, scene.map, expert)
     # Rows tell nothing of the routes, which are the largest part by far.
     none = jnp.zeros((0,), bool)
     corners = CornerLanes(*(none for _ in CornerLanes._fields))
-    return metrics.replace(route=none, expert_route=none, corners=corners)
+    route = metrics.route if keep_route else none
+    return metrics.replace(route=route, expert_route=none, corners=corners)
 
 
 def _open_loop(

@@ -9,6 +9,7 @@ from spdm_experiments.chunks import scenario_files, suite_name
 from spdm_experiments.inventory import Inventory
 from spdm_experiments.options import Simulate
 from spdm_experiments.sequence import usable_inventory
+from spdm_experiments.simulate_scripts import Extras, find_extras
 from spdm_experiments.sources import Selection
 from spdm_experiments.terminal import progress_line
 from spdm_jax import Failure
@@ -27,11 +28,13 @@ class Scenes:
       suite: what they are, for people.
       folder: where their files lie.
       inventory: those selected.
+      extras: of interPlan's scenarios among them.
     """
 
     suite: str
     folder: Path
     inventory: Inventory
+    extras: Extras
 
 
 def find_scenes(options: Simulate) -> Scenes:
@@ -45,7 +48,7 @@ def find_scenes(options: Simulate) -> Scenes:
         raise ValueError(f"--limit is {options.limit}; it must be at least 1")
     if name in suites.suite_names() and not options.scenes.exists():
         folder, files = _packed_suite(name, options)
-        return Scenes(name, folder, _drivable(usable_inventory(files, name)))
+        return Scenes(name, folder, _drivable(usable_inventory(files, name)), {})
     try:
         # Types are known after a look at the files only, and the limit is one of those selected.
         files = scenario_files(options.scenes, None if options.types else options.limit)
@@ -56,7 +59,8 @@ def find_scenes(options: Simulate) -> Scenes:
     if options.types:
         inventory = _of_types(inventory, options)
     sources = sorted({entry.source for entry in inventory.entries})
-    return Scenes(suite_name(options.scenes, sources), options.scenes, _drivable(inventory))
+    inventory, extras = find_extras(_drivable(inventory))
+    return Scenes(suite_name(options.scenes, sources), options.scenes, inventory, extras)
 
 
 def _of_types(inventory: Inventory, options: Simulate) -> Inventory:

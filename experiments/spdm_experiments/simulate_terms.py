@@ -19,5 +19,14 @@ OPEN: Final = {
     "planner_expert_average_heading_error_within_bound": ("Average heading error", "AHE"),
     "planner_expert_final_heading_error_within_bound": ("Final heading error", "FHE"),
 }
-TITLES: Final = {name: title for name, (title, _) in {**CLOSED, **OPEN}.items()}
-SHORT: Final = {name: short for name, (_, short) in {**CLOSED, **OPEN}.items()}
+INTERPLAN: Final = {
+    "interplan_score": ("interPlan's score", "iP"),
+    "lane_changes_to_goal": ("Lane changes to the goal", "LC"),
+    "ego_sorts_construction_zone": ("Gets past the construction zone", "CZ"),
+    "ego_sorts_stopped_vehicle": ("Gets past stopped vehicles", "SV"),
+    "ego_sorts_jaywalking_pedestrian": ("Gets past jaywalkers", "JW"),
+}
+"""Null for every other scenario."""
+_ALL: Final = {**CLOSED, **OPEN, **INTERPLAN}
+TITLES: Final = {name: title for name, (title, _) in _ALL.items()}
+SHORT: Final = {name: short for name, (_, short) in _ALL.items()}

@@ -11,6 +11,7 @@ from spdm_experiments.rows import Layout
 from spdm_experiments.simulate_points import Point
 from spdm_experiments.simulate_rows import histories_of, layout_of, result_rows
 from spdm_experiments.simulate_scene import UNREAD, Switches, run_scene
+from spdm_experiments.simulate_scripts import Extras, ScriptRoom, scripts_of, verdicts_of
 from spdm_experiments.work import Arrays, Engine, Group, Job
 from spdm_jax.padding import bucket
 from spdm_jax.simulation.agent_state import AgentSizes
@@ -32,11 +33,15 @@ class SimulateJob(Job):
       runs: the points, in their order.
       replan_every: steps between two plans.
       plans: whether to write the plans of every step beside the histories.
+      extras: of interPlan's scenarios.
+      rooms: of the scripts of each group; None for a group of scenarios without extras.
     """
 
     runs: list[Point]
     replan_every: int
     plans: bool
+    extras: Extras
+    rooms: list[ScriptRoom | None]
 
     def layout(self) -> Layout:
         """Returns the columns of the rows."""
@@ -61,16 +66,18 @@ class SimulateEngine(Engine):
         assert scenes.batch is not None
         rows: list[dict[str, Any]] = []
         kept: list[Arrays] = []
-        shape = self.job.groups[group]
+        shape, room, extras = self.job.groups[group], self.job.rooms[group], self.job.extras
+        scripts = None if room is None else scripts_of(extras, scenes, room)
         tokens = [entry.token for entry in scenes.entries]
         kinds = np.array(scenes.batch.tracks.type)
         for number, point in enumerate(self.job.runs):
             runner = self.runner(run_scene, switches_of(point, shape, self.job), shape.chunk)
             before = runner.stats.run_s
-            result = runner(scenes.batch, None, point.params)
+            result = runner(scenes.batch, scripts, point.params)
             run_ms = 1e3 * (runner.stats.run_s - before) / len(tokens)
             known = (scenes.entries, scenes.track_ids, kinds)
-            rows += result_rows(self.layout, *known, result, number, run_ms)
+            verdicts = None if room is None else verdicts_of(extras, scenes, result)
+            rows += result_rows(self.layout, *known, result, number, run_ms, verdicts)
             if self.job.arrays:
                 ids = scenes.track_ids
                 kept.append(histories_of(result, tokens, ids, number, scenes.origins))

@@ -167,7 +167,8 @@ def simulate(
       config: static settings.
       facts: `road_facts` of the map where several runs share it.
       script: of an interPlan scenario, `origin` and dtype as the scene's. Its pedestrians see the
-        ego where it was, as agents do; past its goal the run ends without another sample.
+        ego where it was, as agents do; past its goal the run ends without another sample. To a
+        planner that asks how traffic reacts, pedestrians that wait or walk stand where they are.
 
     Source: nuPlan `Simulation`, `SimulationRunner`, `IDMAgents`, `LogPlaybackController`.
     """

@@ -81,7 +81,8 @@ def reactions(
       vehicle: ego dimensions.
       params: nuPlan's settings.
       sizes: static room.
-      script: of an interPlan scenario; pedestrians that wait for the ego stay as they are.
+      script: of an interPlan scenario. Its pedestrians that wait for the ego, or have begun to
+        walk, stay as `future` has them: the simulation gives them standing where they are now.
 
     Returns:
       Poses `[P, A, S]`, every 0.2 s; samples beyond what the drives ask for repeat the last one.
