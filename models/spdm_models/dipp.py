@@ -281,8 +281,12 @@ def apply(
       ValueError: inputs disagree in their number of actors or in a feature axis.
     """
     _check(features)
-    network = module_params.bind(lambda rngs: Predictor(config, rngs), params)
-    return network(features, Dropout(dropout_key))
+    return bind(params, config)(features, Dropout(dropout_key))
+
+
+def bind(params: Params, config: DIPPConfig) -> Predictor:
+    """Returns the network with its weights, to use inside one traced call."""
+    return module_params.bind(lambda rngs: Predictor(config, rngs), params)
 
 
 def _check(features: DIPPFeatures) -> None:

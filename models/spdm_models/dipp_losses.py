@@ -37,8 +37,8 @@ class PlannerLoss(struct.PyTreeNode, kw_only=True):
     """Loss with the planner in the loop.
 
     Attributes:
-      total: futures + plan + 1e-3 plan_cost.
-      futures: loss of the joint futures.
+      total: futures.total + plan + 1e-3 plan_cost.
+      futures: loss of the joint futures; the best one is refined.
       plan: loss of the refined plan.
       plan_cost: mean squared weighted residual of the refined plan.
       controls: `[B, T, 2]` refined controls.
@@ -46,7 +46,7 @@ class PlannerLoss(struct.PyTreeNode, kw_only=True):
     """
 
     total: Array
-    futures: Array
+    futures: FutureLoss
     plan: Array
     plan_cost: Array
     controls: Array
@@ -137,9 +137,7 @@ def planner_loss(
     predictions = pick(output.predictions, futures.best_mode)
 
     def refine(controls, ego, neighbors, predictions, ref_line):
-        problem = problem_from_features(
-            ego, neighbors, predictions, ref_line, output.cost_weights
-        )
+        problem = problem_from_features(ego, neighbors, predictions, ref_line, output.cost_weights)
         solution = solve(controls, problem, TRAIN_SOLVER, config)
         refined = solution.values.reshape(controls.shape)
         return refined, plan_trajectories(refined, ego), solution.objective
@@ -152,7 +150,7 @@ def planner_loss(
     cost = 2 * jnp.mean(objective) / config.num_residuals
     return PlannerLoss(
         total=futures.total + plan + PLAN_COST_FACTOR * cost,
-        futures=futures.total,
+        futures=futures,
         plan=plan,
         plan_cost=cost,
         controls=refined,

@@ -17,6 +17,9 @@ from .closed_loop import replay  # noqa: E402
 from .loader import check_loader_golden  # noqa: E402
 from .logged_run import check_logged_run  # noqa: E402
 from .metrics import check_metrics  # noqa: E402
+from .models_dipp import check_dipp  # noqa: E402
+from .models_dtpp import check_dtpp  # noqa: E402
+from .models_gameformer import check_gameformer  # noqa: E402
 from .pdm import check_scene, check_scorer  # noqa: E402
 from .planning import check_planning  # noqa: E402
 from .report import Report  # noqa: E402
@@ -61,6 +64,7 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
     }
     # Told apart by the description beside the arrays; several may look at one file.
     by_description = (check_metrics, check_simulation)
+    by_model = (check_dipp, check_dtpp, check_gameformer)
     for path in sorted(folder.rglob("*")):
         if not path.is_file() or only not in path.name:
             continue
@@ -75,6 +79,8 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
         elif path.name.startswith("unit_") and check_unit(path, report, dtype):
             pass
         elif any([check(path, report, dtype) for check in by_description]):
+            pass
+        elif any(check(path, report, dtype) for check in by_model):
             pass
         else:
             check = next((c for p, c in by_prefix.items() if path.name.startswith(p)), None)
