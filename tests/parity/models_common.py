@@ -15,6 +15,8 @@ LOSS_TOLERANCE = 1e-5
 """Relative; the reference's own float32 error is 4e-7."""
 GRADIENT_TOLERANCE = 1e-3
 """Of a tensor's largest entry, float32; the reference's own error is up to 1e-4."""
+ROUNDING_SHARE = 1e-3
+"""A tensor's gradient below this share of the norm of all is held to it."""
 EXACT_TOLERANCE = 1e-9
 """Float64 against float64, relative to the largest entry."""
 
@@ -62,11 +64,13 @@ def check_recipe(report, file: str, weights: dict, data) -> None:
     report.close(file, "parameter sums", sums, data["param_sums"], 1e-9)
 
 
-def close_relative(report, file, array, ours, reference, tolerance, mask=None, note="") -> None:
-    """Compares with a tolerance in parts of the reference's largest entry (at least 1e-6)."""
+def close_relative(
+    report, file, array, ours, reference, tolerance, mask=None, note="", least=1e-6
+) -> None:
+    """Compares with a tolerance in parts of the reference's largest entry, at least of `least`."""
     reference = np.asarray(reference, float)
     finite = np.abs(reference[np.isfinite(reference)])
-    largest = max(float(finite.max()) if finite.size else 0.0, 1e-6)
+    largest = max(float(finite.max()) if finite.size else 0.0, least)
     report.close(file, array, ours, reference, tolerance * largest, mask, note=note)
 
 
@@ -85,16 +89,16 @@ def close_gradients(
       tolerance: of each tensor's largest entry.
     """
     flat = flatten(gradients)
+    names = [key.removeprefix(norms) for key in data.files if key.startswith(norms)]
+    reference = np.array([float(data[norms + name]) for name in names])
+    # Gradients that are zero but for rounding have no relative error.
+    floor = max(ROUNDING_SHARE * float(np.sqrt(np.sum(reference**2))), 1e-6)
     for key in data.files:
         if key.startswith(prefix):
             name = key.removeprefix(prefix)
-            close_relative(report, file, key, flat[name], data[key], tolerance)
-    names = [key.removeprefix(norms) for key in data.files if key.startswith(norms)]
+            close_relative(report, file, key, flat[name], data[key], tolerance, least=floor)
     if names:
-        reference = np.array([float(data[norms + name]) for name in names])
         ours = np.array([float(jnp.sqrt(jnp.sum(jnp.square(flat[name])))) for name in names])
-        # Norms that are zero but for rounding have no relative error.
-        floor = 1e-6 * np.sqrt(np.sum(reference**2))
         relative = (ours - reference) / np.maximum(reference, floor)
         report.close(file, f"{norms}*", relative, np.zeros_like(relative), tolerance)
 
