@@ -8,8 +8,17 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from spdm_experiments import bench, bench_page, bench_process, bench_rows, bench_scenes
+from spdm_experiments import (
+    bench,
+    bench_drives,
+    bench_page,
+    bench_process,
+    bench_rows,
+    bench_scenes,
+    bench_watch,
+)
 from spdm_jax import from_raw
+from spdm_jax.synthetic.suites import SUITES
 from spdm_jax.types import SubScores
 
 ABOUT = {
@@ -26,6 +35,7 @@ ABOUT = {
 }
 APART = {
     "first call, SPDM 60": {"cold_s": 5.0, "warm_s": 0.6, "import_s": 1.0, "repetitions": 3},
+    "first drive, reactive": {"cold_s": 31.0, "warm_s": 1.5, "import_s": 1.0, "repetitions": 3},
     "memory, 4096 trajectories": {"before_mb": 200.0, "peak_mb": 400.0},
     "memory, 16 scenes": {"before_mb": 200.0, "peak_mb": 500.0},
     "memory, 256 scenes": {"before_mb": 200.0, "peak_mb": 1200.0},
@@ -36,6 +46,15 @@ APART = {
         "kernel_ms": 10.0,
         "yardstick_ms": 20.0,
     },
+}
+
+
+DRIVES = {
+    "traffic": "reactive",
+    "seconds": 15.0,
+    "suite": "common-14",
+    "kinds": 8,
+    "num_proposals": 60,
 }
 
 
@@ -64,6 +83,10 @@ def made_up_rows() -> list[dict]:
     stage = row("SPDM 60: track", 0.125)
     del stage["first_call_s"]
     return [
+        *(
+            row(f"{n} drive(s), reactive", 500.0 + 750.0 * n, **DRIVES, drives=n)
+            for n in (1, 8, 32)
+        ),
         row("PDM-Closed 15", 3.0, failing=failing),
         row("SPDM 60", 9.0, failing=failing),
         stage,
@@ -105,11 +128,24 @@ def test_page_says_what_was_reached_and_where(tmp_path: Path):
     for words, answer in reached.items():
         assert line_with(text, words).endswith(f"| {answer} |"), words
     assert "3.0 / 1.5 ms | 20.0 ms | 0.15 |" in line_with(text, "one PDM-Closed step")
+    drives = text[text.index("## Closed loop") : text.index("## Other precision")]
+    assert "SPDM 60 through 15 s" in drives
+    expected = ["1 | 1 s | 1.25 / 0.62 s | 62 | no", "8 | 1 s | 0.81 / 0.41 s | 41 | yes"]
+    expected += ["first drive, cold cache | 30 s | 31.00 s |  | no"]
+    expected += ["first drive, warm cache | 2 s | 1.50 s |  | yes"]
+    for words in expected:
+        assert f"| reactive | {words} |" in drives
     columns = text[text.index("## Other precision") :]
     assert "17.2 / 8.6 | 13.8 / 6.9" in line_with(columns, "one SPDM step")
     assert line_with(text, "| track |") == "| track | 0.12 |"
     assert "0.250" in line_with(text[text.index("## All rows") :], "| PDM-Closed 15 |")
     assert text.rstrip().endswith(bench_page.KEPT)
+
+
+def test_page_without_drives_has_no_section_of_them(tmp_path: Path):
+    rows = [row for row in made_up_rows() if "drives" not in row]
+    bench_page.write_page(tmp_path / "page.md", ABOUT, rows, {})
+    assert "## Closed loop" not in (tmp_path / "page.md").read_text(encoding="utf-8")
 
 
 def test_page_keeps_what_people_wrote(tmp_path: Path):
@@ -175,6 +211,28 @@ def test_crossings_hold_what_they_should():
         bench_scenes.check_counts(fewer)
 
 
+def test_drives_of_a_batch_are_those_of_scenarios_alone():
+    alone = {"token": "a", "status": "ok", "reason": "", "score": 0.5, "run_ms": 1.0}
+    other = {**alone, "token": "b", "score": 1.0}
+    assert bench_drives.check([alone, other], {**alone, "run_ms": 2.0}) == {"mean_score": 0.75}
+    with pytest.raises(RuntimeError, match="depends on the 2 scenarios"):
+        bench_drives.check([alone, other], {**alone, "score": 0.25})
+    with pytest.raises(RuntimeError, match="b: no room"):
+        bench_drives.check([alone, {**other, "status": "overflow", "reason": "no room"}], None)
+
+
+def test_drives_are_packed_by_number(tmp_path: Path):
+    count = len(bench_drives.TYPES)
+    tokens = bench_drives.drive_tokens(count + 1)
+    assert tokens == [*(f"{kind}-00" for kind in bench_drives.TYPES), f"{tokens[0][:-3]}-01"]
+    assert set(bench_drives.TYPES) <= SUITES[bench_drives.SUITE].keys()
+    for token in reversed(tokens):
+        (tmp_path / "drives").mkdir(exist_ok=True)
+        (tmp_path / "drives" / f"{token}.npz").touch()
+    files = bench_scenes.scene_files(tmp_path, "drives")
+    assert [path.stem for path in files] == tokens
+
+
 def test_packed_scenes_come_by_seed(tmp_path: Path):
     bench_scenes.pack_scenes(tmp_path, 2, 2, 2)
     names = [path.stem for path in bench_scenes.scene_files(tmp_path, "crossings")]
@@ -204,13 +262,15 @@ def test_programs_that_disagree_are_refused():
 
 def test_stopwatch_checks_the_first_result():
     calls = []
-    found = bench_rows.Stopwatch(3)(
+    found = bench_watch.Stopwatch(3)(
         lambda: calls.append(0) or len(calls), lambda n: calls.append(n)
     )
     assert calls[1] == 1 and len(calls) == 1 + 1 + 2 + 3
+    bench_watch.Stopwatch(3, warmups=0)(lambda: calls.append(0))
+    assert len(calls) == 7 + 1 + 3
     assert found["repetitions"] == 3 and found["min_ms"] <= found["median_ms"]
     with pytest.raises(ValueError, match="wrong"):
-        bench_rows.Stopwatch(1)(lambda: None, lambda _: (_ for _ in ()).throw(ValueError("wrong")))
+        bench_watch.Stopwatch(1)(lambda: None, lambda _: (_ for _ in ()).throw(ValueError("wrong")))
 
 
 def test_results_go_on_only_with_the_same_facts(tmp_path: Path):
@@ -228,6 +288,16 @@ def test_results_go_on_only_with_the_same_facts(tmp_path: Path):
     assert again.rows == [{"workload": "w"}] and again.apart == {"sweep": {"ratio": 1.0}}
     other = bench.Results(path, {"code": "b"}, {"date": "3"})
     assert not other.resumed and other.rows == [] and other.about == {"date": "3"}
+
+
+def test_only_what_was_asked_for_is_measured(tmp_path: Path):
+    results = bench.Results(tmp_path / "bench.json", {}, {}, ["drives", "first drive"])
+    for name in ("steps, f32, 2 core(s)", "drives, f32, 2 core(s)", "first drive, replay"):
+        results.unit(name, lambda: {"cold_s": 1.0})
+    assert list(results.units) == ["drives, f32, 2 core(s)", "first drive, replay"]
+    every = bench.Results(tmp_path / "bench.json", {}, {})
+    every.unit("sweep", lambda: {"ratio": 1.0})
+    assert len(every.units) == 3
 
 
 def test_failed_child_leaves_what_was_finished(tmp_path: Path, monkeypatch, capsys):
@@ -262,6 +332,8 @@ def test_finished_run_writes_table_and_page(tmp_path: Path, monkeypatch, capsys)
         (["--page", "performance.txt"], "must end in .md"),
         (["--out", "FILE"], "is a file"),
         (["--device", "abacus"], "invalid choice"),
+        (["--only", "lunch"], "invalid choice"),
+        (["--only", "drives", "--page", "page.md"], "--page shows all rows"),
     ],
 )
 def test_useless_arguments_are_refused(arguments, words, tmp_path: Path, capsys):

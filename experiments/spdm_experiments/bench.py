@@ -26,6 +26,8 @@ VERSIONED = ("spdm-jax", "jax", "jaxlib", "numpy")
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}
 FIRST_CALLS = 3
 """First calls of each planner with an empty compile cache (and as many with a full one)."""
+KINDS = ("steps", "fans", "batches", "drives", "first call", "first drive", "memory", "sweep")
+"""What the names of units begin with."""
 
 
 class Results:
@@ -36,10 +38,17 @@ class Results:
       facts: what must be the same for a run that goes on.
       units: name -> rows of a child, or the one row of a process.
       resumed: whether an earlier run of the same facts left something.
+      only: kinds of units to measure, of `KINDS`; all if empty.
     """
 
-    def __init__(self, path: Path, facts: Mapping[str, Any], about: Mapping[str, Any]):
-        self.path, self.facts = path, dict(facts)
+    def __init__(
+        self,
+        path: Path,
+        facts: Mapping[str, Any],
+        about: Mapping[str, Any],
+        only: Sequence[str] = (),
+    ):
+        self.path, self.facts, self.only = path, dict(facts), tuple(only)
         self.about, self.units, self.resumed = dict(about), dict[str, Any](), False
         if path.is_file():
             before = json.loads(path.read_text(encoding="utf-8"))
@@ -56,12 +65,12 @@ class Results:
         partial.replace(self.path)
 
     def unit(self, name: str, measure: Callable[[], Any]) -> Any:
-        """Returns what a unit found, now or earlier."""
-        if name not in self.units:
+        """Returns what a unit found, now or earlier; None if it was not asked for."""
+        if name not in self.units and name.startswith(self.only or ""):
             print(name, file=sys.stderr, flush=True)
             self.units[name] = measure()
             self.save()
-        return self.units[name]
+        return self.units.get(name)
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -123,10 +132,10 @@ def _answer(what: str, scenes: Path) -> int:
     return 0
 
 
-def _first_calls(scenes: Path, planner: str, count: int) -> dict[str, Any]:
+def _first_calls(mode: str, scenes: Path, *arguments: str) -> dict[str, Any]:
     """First calls of a process with an empty compile cache, and with one that has the program."""
     call = lambda cache: _run(
-        "bench_process", ["first_call", str(scenes), planner, str(count)], SPDM_COMPILE_CACHE=cache
+        "bench_process", [mode, str(scenes), *arguments], SPDM_COMPILE_CACHE=cache
     )
     cold, warm = [], []
     for _ in range(FIRST_CALLS):
@@ -158,13 +167,13 @@ def measure_all(results: Results, out: Path, scale: str) -> None:
     from spdm_jax.batching import usable_cores
 
     full, cores, scenes, cache = scale == "full", usable_cores(), out / "scenes", out / "cache"
-    amounts = ("64", "64", "4") if full else ("2", "2", "1")
+    amounts = ("64", "64", "4", "32") if full else ("2", "2", "1", "1")
     # Not under `unit`: files may be lost, and those that are there are kept.
     print("scenes", file=sys.stderr, flush=True)
     _run("bench_process", ["scenes", str(scenes), *amounts])
 
     def children(cores: int, precision: str, scale: str) -> None:
-        for group in ("steps", "fans", "batches"):
+        for group in ("steps", "fans", "batches", "drives"):
             name = f"{group}, {precision}, {cores} core(s)"
             results.unit(name, lambda g=group: _child(g, cores, precision, scale, scenes))
 
@@ -173,15 +182,18 @@ def measure_all(results: Results, out: Path, scale: str) -> None:
     planners = (("PDM-Closed", 15), ("SPDM", 60)) if full else ()
     memories = (("trajectories", 4096), ("scenes", 16), ("scenes", 64), ("scenes", 256))
     for planner, count in planners:
-        found = lambda p=planner, n=count: _first_calls(scenes, p, n)
+        found = lambda p=planner, n=count: _first_calls("first_call", scenes, p, str(n))
         results.unit(f"first call, {planner} {count}", found)
+    for traffic in ("replay", "reactive") if full else ():
+        found = lambda t=traffic: _first_calls("first_drive", scenes, t)
+        results.unit(f"first drive, {traffic}", found)
     for kind, count in memories if full else (("trajectories", 64), ("scenes", 2)):
         found = lambda k=kind, n=count: _memory(scenes, cache, k, n)
         results.unit(f"memory, {count} {kind}", found)
     arguments = ["sweep", str(scenes), *(("64", "7") if full else ("2", "2"))]
     results.unit("sweep", lambda: _run("bench_process", arguments, SPDM_COMPILE_CACHE=str(cache)))
     if full:
-        if results.rows[0]["platform"] == "cpu" and cores > 1:
+        if cores > 1 and any(row["platform"] == "cpu" for row in results.rows):
             children(1, "f32", "half")
         children(cores, "f64", "half")
 
@@ -191,6 +203,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write")
     parser.add_argument("--quick", action="store_true", help="a toy run that shows it works")
     parser.add_argument("--page", type=Path, help="Markdown page to write, with curves beside it")
+    parser.add_argument("--only", choices=KINDS, nargs="+", default=(), help="kinds of rows")
     parser.add_argument("--again", action="store_true", help="measure anew what is there already")
     parser.add_argument("--device", choices=("auto", *PLATFORMS), default="auto")
     parser.add_argument("--child", default="", help=argparse.SUPPRESS)
@@ -199,6 +212,8 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--out {options.out} is a file; name a folder")
     if options.page and options.page.suffix != ".md":
         parser.error(f"--page {options.page} must end in .md")
+    if options.page and options.only:
+        parser.error("--page shows all rows; leave --only out, what is measured already stays")
     return options
 
 
@@ -234,7 +249,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     }
     if options.again:
         (options.out / FILE).unlink(missing_ok=True)
-    results = Results(options.out / FILE, facts, about)
+    results = Results(options.out / FILE, facts, about, options.only)
     if results.resumed:
         print(f"{results.path}: {len(results.units)} units are there already", file=sys.stderr)
     try:

@@ -32,6 +32,8 @@ QUOTED = {
 }
 """The published reference on one thread of this class of machine, when the yardstick took 29 ms:
 quoted, not measured here."""
+DRIVE_S, DRIVE_COLD_S, DRIVE_WARM_S = 1.0, 30.0, 2.0
+"""What a drive is to take per scenario, and the first one with an empty and a filled cache."""
 SWEEP_RATIO, COLD_S, WARM_S, PEAK_MB, FLAT = 1.5, 6.0, 0.5, 1000.0, 1.1
 """What the rows of processes of their own are to reach; the last is peak memory over that of the
 fewest scenes."""
@@ -67,6 +69,7 @@ def write_page(page: Path, about: Row, rows: Sequence[Row], apart: Mapping[str, 
         "# Performance\n",
         _about(about, main),
         _marks(main, apart),
+        _drives(main, apart),
         "## Other precision, other cores\n\nMedian / minimum, ms.\n",
         _columns(rows),
         "## Cost over trajectories and over scenes\n",
@@ -177,6 +180,37 @@ def _apart(apart: Mapping[str, Row]) -> list[tuple[str, str, str, str]]:
         words = "peak memory of the most scenes over that of the fewest"
         lines.append((words, f"{FLAT:g}", f"{ratio:.2f}", _reached(ratio, FLAT)))
     return lines
+
+
+def _drives(rows: Sequence[Row], apart: Mapping[str, Row]) -> str:
+    """The section on whole drives; empty where none were measured."""
+    body = []
+    found = [row for row in rows if "drives" in row]
+    for row in found:
+        median, least = (row[name] / (1e3 * row["drives"]) for name in ("median_ms", "min_ms"))
+        sticks = f"{row['median_ms'] / row['drives'] / row['yardstick_ms']:.0f}"
+        text = f"{median:.2f} / {least:.2f} s"
+        mark, reached = f"{DRIVE_S:g} s", _reached(median, DRIVE_S)
+        body.append([row["traffic"], str(row["drives"]), mark, text, sticks, reached])
+    for unit, call in apart.items():
+        if unit.startswith("first drive"):
+            for kind, mark in (("cold", DRIVE_COLD_S), ("warm", DRIVE_WARM_S)):
+                seconds, traffic = call[f"{kind}_s"], unit.partition(", ")[2]
+                cells = [f"{mark:g} s", f"{seconds:.2f} s", "", _reached(seconds, mark)]
+                body.append([traffic, f"first drive, {kind} cache", *cells])
+    if not body:
+        return ""
+    text = ""
+    if found:
+        text = (
+            f"SPDM {found[0]['num_proposals']} through {found[0]['seconds']:g} s of traffic, as "
+            f"`spdm simulate` does, metrics included; scenarios of {found[0]['suite']}, as many of "
+            f"each of {found[0]['kinds']} types in every batch. Seconds per scenario, median / "
+            f"minimum of {found[0]['repetitions']} runs. The first scenario of a batch has the row "
+            "that it has alone, bit by bit.\n\n"
+        )
+    head = ["traffic", "scenarios", "to reach", "per scenario", "yardsticks", "reached"]
+    return f"## Closed loop\n\n{text}{markdown_table(head, body)}"
 
 
 def _columns(rows: Sequence[Row]) -> str:

@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 
 def peak_mb() -> float:
@@ -27,12 +27,14 @@ def peak_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def scenes(folder: str, crossings: str, mixed: str, copies: str) -> dict[str, Any]:
+def scenes(folder: str, crossings: str, mixed: str, copies: str, drives: str) -> dict[str, Any]:
     """Packs the scenes of a run."""
+    from spdm_experiments.bench_drives import pack_drives
     from spdm_experiments.bench_scenes import pack_scenes
 
     started = time.perf_counter()
     pack_scenes(Path(folder), int(crossings), int(mixed), int(copies))
+    pack_drives(Path(folder), int(drives))
     return {"seconds": time.perf_counter() - started}
 
 
@@ -54,6 +56,26 @@ def first_call(folder: str, planner: str, count: str) -> dict[str, Any]:
     began = time.perf_counter()
     plan(scene, spec)
     return {"first_call_s": time.perf_counter() - began, "import_s": imported}
+
+
+def first_drive(folder: str, traffic: Literal["replay", "reactive"]) -> dict[str, Any]:
+    """Measures the first drive of a process, imports and reading the scenario apart."""
+    started = time.perf_counter()
+    import jax
+
+    from spdm_experiments.bench_drives import Drives, check
+    from spdm_experiments.bench_scenes import scene_files
+    from spdm_jax.compile_cache import enable_compile_cache
+
+    enable_compile_cache()
+    jax.devices()
+    imported = time.perf_counter() - started
+    engine, scenario = Drives(scene_files(Path(folder), "drives")[:1], traffic, "f32").load(1)
+    began = time.perf_counter()
+    rows, _ = engine.compute(scenario, 0)
+    seconds = time.perf_counter() - began
+    check(rows, None)
+    return {"first_call_s": seconds, "import_s": imported}
 
 
 def memory(folder: str, kind: str, count: str) -> dict[str, Any]:
@@ -87,7 +109,7 @@ def sweep(folder: str, count: str, repetitions: str) -> dict[str, Any]:
     import numpy as np
 
     from spdm_experiments import cli
-    from spdm_experiments.bench_rows import Stopwatch
+    from spdm_experiments.bench_watch import Stopwatch
 
     watch, runs = Stopwatch(int(repetitions)), []
     with tempfile.TemporaryDirectory() as base:
@@ -128,6 +150,7 @@ def _sweep(run: Callable[[list[str]], int], folder: Path, out: Path, count: int)
 MODES: dict[str, Callable[..., dict[str, Any]]] = {
     "scenes": scenes,
     "first_call": first_call,
+    "first_drive": first_drive,
     "memory": memory,
     "sweep": sweep,
 }

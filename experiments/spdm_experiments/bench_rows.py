@@ -1,7 +1,6 @@
 """Rows of one child process of the benchmark: steps, sets of trajectories, batches of scenes."""
 
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,8 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from spdm_experiments.bench_drives import drives
 from spdm_experiments.bench_scenes import check_counts, scene_files
 from spdm_experiments.bench_stages import stages
+from spdm_experiments.bench_watch import Stopwatch
 from spdm_jax import (
     PlannerConfig,
     PlannerParams,
@@ -55,6 +56,7 @@ class Size:
       fans: numbers of trajectories.
       batches: numbers of crossings planned in one call, with the last planner.
       mixed: number of built-in scenes planned in one call.
+      drives: numbers of scenarios driven through in one call, in closed loop.
       stages: whether to time the stages of each step.
     """
 
@@ -63,6 +65,7 @@ class Size:
     fans: tuple[int, ...]
     batches: tuple[int, ...]
     mixed: int
+    drives: tuple[int, ...]
     stages: bool = True
 
 
@@ -73,11 +76,12 @@ SIZES = {
         (64, 256, 1024, 2048, 4096),
         (1, 4, 16, 32, 64),
         64,
+        (1, 8, 16, 32),
     ),
-    "half": Size(15, (("PDM-Closed", 15), ("SPDM", 60)), (4096,), (64,), 64, stages=False),
-    "quick": Size(3, (("PDM-Closed", 15),), (64,), (2,), 2),
+    "half": Size(15, (("PDM-Closed", 15), ("SPDM", 60)), (4096,), (64,), 64, (8,), stages=False),
+    "quick": Size(3, (("PDM-Closed", 15),), (64,), (2,), 2, (1,)),
 }
-GROUPS = ("steps", "fans", "batches")
+GROUPS = ("steps", "fans", "batches", "drives")
 """What one child measures."""
 
 
@@ -95,61 +99,6 @@ def fan(count: int) -> np.ndarray:
     return np.stack([x, y, heading], axis=-1)
 
 
-class Stopwatch:
-    """Times calls between repetitions of the yardstick.
-
-    Attributes:
-      repetitions: of every call.
-    """
-
-    def __init__(self, repetitions: int):
-        self.repetitions = repetitions
-        self._matrix = np.random.default_rng(0).normal(size=(1024, 1024)).astype(np.float32)
-
-    def yardstick(self) -> float:
-        """Returns the seconds of one 1,024 x 1,024 float32 matrix product of NumPy."""
-        started = time.perf_counter()
-        _ = self._matrix @ self._matrix
-        return time.perf_counter() - started
-
-    def __call__(
-        self, call: Callable[[], Any], check: Callable[[Any], Any] | None = None
-    ) -> dict[str, Any]:
-        """First call apart, then the check, two warm-ups, and interleaved repetitions.
-
-        Args:
-          call: waits for its result.
-          check: given the first result; raises if it is wrong.
-
-        Returns:
-          First call in s; median and minimum of wall time, median CPU time of the process and of
-          the yardstick in ms.
-        """
-        started = time.perf_counter()
-        found = call()
-        first = time.perf_counter() - started
-        if check is not None:
-            check(found)
-        call()
-        self.yardstick()
-        call()
-        runs, used, sticks = [], [], []
-        for _ in range(self.repetitions):
-            sticks.append(self.yardstick())
-            started, cpu = time.perf_counter(), time.process_time()
-            call()
-            runs.append(time.perf_counter() - started)
-            used.append(time.process_time() - cpu)
-        return {
-            "first_call_s": first,
-            "median_ms": 1e3 * float(np.median(runs)),
-            "min_ms": 1e3 * min(runs),
-            "cpu_ms": 1e3 * float(np.median(used)),
-            "yardstick_ms": 1e3 * float(np.median(sticks)),
-            "repetitions": self.repetitions,
-        }
-
-
 def measure(group: str, size: Size, precision: Precision, folder: Path) -> list[dict[str, Any]]:
     """Measures one group of rows; sets JAX's precision for the whole process.
 
@@ -165,8 +114,13 @@ def measure(group: str, size: Size, precision: Precision, folder: Path) -> list[
     if precision == "f64":
         jax.config.update("jax_enable_x64", True)
     enable_compile_cache()
-    child = _Child(size, precision, folder)
-    {"steps": child.steps, "fans": child.fans, "batches": child.batches}[group]()
+    child = Child(size, precision, folder)
+    {
+        "steps": child.steps,
+        "fans": child.fans,
+        "batches": child.batches,
+        "drives": lambda: drives(child),
+    }[group]()
     device = jax.devices()[0]
     about = {
         "group": group,
@@ -178,7 +132,9 @@ def measure(group: str, size: Size, precision: Precision, folder: Path) -> list[
     return [{**about, **row} for row in child.rows]
 
 
-class _Child:
+class Child:
+    """Rows of one group, and what they need."""
+
     def __init__(self, size: Size, precision: Precision, folder: Path):
         self.size, self.folder = size, folder
         self.precision: Precision = precision

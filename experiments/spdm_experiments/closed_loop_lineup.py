@@ -21,7 +21,7 @@ LINEUP: Final[tuple[Mapping[str, Any], ...]] = (
 """Options of `spdm simulate`, one entry per product of planners and settings."""
 WORDS: Final = {
     ("progress_reference", "centerline"): "progress along the centreline",
-    ("borrow_oncoming", True): "may borrow the oncoming lane",
+    ("borrow_oncoming", "yes"): "may borrow the oncoming lane",
 }
 """What the name of a row says of a setting, for settings that are not the planner's own."""
 
@@ -76,7 +76,8 @@ class Suite:
         # That of a folder is one of all its files, whatever types are taken.
         facts = [*(part.digest for part in parts), *(entry.token for entry in entries)]
         digest = hashlib.sha256(repr(facts).encode()).hexdigest()
-        return replace(each[0], inventory=Inventory(entries, failures, digest))
+        extras = {token: one for scenes in each for token, one in scenes.extras.items()}
+        return replace(each[0], inventory=Inventory(entries, failures, digest), extras=extras)
 
 
 SUITES: Final = (

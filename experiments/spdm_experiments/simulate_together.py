@@ -48,4 +48,6 @@ def together(options: Simulate, entries: Sequence[Entry], points: Sequence[Point
         runs=list(points),
         replan_every=options.replan_every,
         plans=False,
+        extras={},
+        rooms=[None],
     )
