@@ -107,12 +107,6 @@ def metrics(output: GameFormerOutput, targets: Targets) -> MotionMetrics:
     )
 
 
-def mode_margin(level: LevelOutput, targets: Targets) -> jax.Array:
-    """Returns the smallest gap between an agent's best and second-best mode, m."""
-    miss = jnp.sort(_miss(_masked(level.gaussians, targets), _truth(targets)), axis=-1)
-    return jnp.min(miss[..., 1] - miss[..., 0])
-
-
 def _truth(targets: Targets) -> jax.Array:
     """Positions `[B, A, T, 2]` of ego and neighbours."""
     return jnp.concatenate([targets.ego[..., None, :, :2], targets.neighbors[..., :2]], axis=-3)
