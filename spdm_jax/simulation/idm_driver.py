@@ -143,6 +143,15 @@ def follow_path(
     )
     barred = corridor_hits_lights(axis, half_width, red)
 
+    def standing(progress):
+        x, y, heading = interpolate(path, progress)
+        return box_at(x, y, heading, first.half_length, first.half_width), heading
+
+    def rear_axle(progress):
+        box, heading = standing(progress)
+        reach = vehicle.rear_axle_to_center
+        return box.x - reach * box.cos, box.y - reach * box.sin, heading
+
     def sample(carry, _):
         progress, v, box, heading = carry
         hit = present & (in_corridor | boxes_overlap(box, others))
@@ -160,17 +169,13 @@ def follow_path(
         accel = idm_acceleration(v, target_speed, space, lead_speed, params)
         progress = progress + v * SAMPLE_SECONDS
         v = jnp.maximum(v + accel * SAMPLE_SECONDS, 0)
-        x, y, heading = interpolate(path, progress)
-        cos, sin = jnp.cos(heading), jnp.sin(heading)
-        box = Box(x, y, cos, sin, box.half_length, box.half_width)
-        reach = vehicle.rear_axle_to_center
-        return (progress, v, box, heading), (x - reach * cos, y - reach * sin, heading)
+        return (progress, v, *standing(progress)), rear_axle(progress)
 
-    begin = (start, ego.vx, first, ego.heading)
-    _, poses = jax.lax.scan(sample, begin, None, length=NUM_SAMPLES)
+    # The plan starts on the path, not at the ego: the tracker is to see how far the ego is off it.
+    _, poses = jax.lax.scan(sample, (start, ego.vx, *standing(start)), None, length=NUM_SAMPLES)
     x, y, heading = (
         jnp.concatenate([now[None], rest])
-        for now, rest in zip((ego.x, ego.y, ego.heading), poses, strict=True)
+        for now, rest in zip(rear_axle(start), poses, strict=True)
     )
     seconds = jnp.arange(NUM_SAMPLES + 1).astype(dtype) * SAMPLE_SECONDS
     plan = Plan(x=x, y=y, heading=heading, time=seconds, start=time)
