@@ -110,7 +110,7 @@ def test_open_loop_has_one_kind_of_traffic():
 
 def test_unknown_planner_is_refused_with_a_list(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["simulate", "common-14", "--planner", "idm-mobil"])
+        cli.main(["simulate", "common-14", "--planner", "pdm-open"])
     assert stop.value.code == 2
     printed = capsys.readouterr()
     assert "constant-velocity" in printed.out + printed.err

@@ -1,5 +1,6 @@
 """interPlan scenarios from nuPlan logs."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -56,6 +57,14 @@ class InterplanReader:
         # The reader below takes the suffixes for something that nobody follows.
         recorded = [note for note in self._reader.notes if SUFFIX_NOTE not in note]
         self.notes = [*config.notes, *recorded, *_left_out(given, self._names, config)]
+        if count := scenario_filter.num_scenarios_per_type:
+            types = Counter(self._changes[name].scenario_type for name in self._names)
+            self.notes += [
+                f"num_scenarios_per_type is {count} and not applied: {number} scenarios are of "
+                f"type {kind}"
+                for kind, number in types.items()
+                if number > count
+            ]
 
     def tokens(self) -> Sequence[str]:
         """Returns the names of the scenarios that the logs hold, in the filter's order."""

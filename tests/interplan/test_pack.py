@@ -26,7 +26,7 @@ defaults:
   - modifications: interPlan_modifications
 scenario_types: null
 scenario_tokens: [{TOKEN}-s0, {TOKEN}-dhgs]
-num_scenarios_per_type: null
+num_scenarios_per_type: 1
 """
 
 
@@ -54,7 +54,8 @@ def test_scenarios_and_extras_lie_side_by_side(data: Path, changes: Path, tmp_pa
     chosen, out = tmp_path / "filter.yaml", tmp_path / "out"
     chosen.write_text(FILTER)
     assert pack(data, out, changes, "--filter", str(chosen)) == 0
-    assert "unmodified" not in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "unmodified" not in said and "per_type" not in said
     names = [f"{TOKEN}-dhgs", f"{TOKEN}-s0"]
     assert sorted(path.stem for path in out.glob("*.npz")) == names
     for name in names:
@@ -90,11 +91,15 @@ def test_types_are_those_of_the_changes(data: Path, changes: Path, tmp_path: Pat
 def test_what_is_left_out_or_unknown_is_said(data: Path, changes: Path, tmp_path: Path, capsys):
     other = "7e3e3769e416290e"
     tokens = [f"{TOKEN}-a0", f"{other}-a1", TOKEN, "f" * 16 + "-a0"]
-    assert pack(data, tmp_path / "out", changes, "--token", *tokens, "--limit", "1") == 0
+    chosen = tmp_path / "filter.yaml"
+    chosen.write_text(FILTER)
+    given = ["--filter", str(chosen), "--limit", "1", "--token", *tokens]
+    assert pack(data, tmp_path / "out", changes, *given) == 0
     said = capsys.readouterr().err
     assert f"1 of 4 scenario_tokens have no code and are left out, the first is {TOKEN}" in said
     assert f"the first is {other}-a1: no goal positions" in said
     assert "1 of 3 scenario_tokens were not found" in said and "f" * 16 in said
+    assert "num_scenarios_per_type is 1 and not applied: 2 scenarios are of type standard" in said
 
 
 @pytest.mark.parametrize(
