@@ -283,7 +283,7 @@ def test_figures_have_published_scores_as_hollow_marks(runs: list[Run]):
     ours, theirs = lines["SPDM"], lines["SPDM, published"]
     assert np.asarray(ours.get_xdata()).tolist() == [15, 20, 25, 30, 45, 60]
     assert np.asarray(theirs.get_ydata()).tolist() == [42.0, 49.72, 52.77, 59.07, 62.37, 63.66]
-    assert theirs.get_markerfacecolor() == "white"
+    assert theirs.get_markerfacecolor() == "none"
     assert np.asarray(lines["PDM-Closed, published"].get_xdata()).tolist() == [15, 60]
     left, right = closed_loop_figures.plot_difference(panels).axes
     means = [np.asarray(line.get_xdata()).tolist() for line in left.get_lines()[:2]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,6 +24,8 @@ LOOKS: Final[dict[str, dict[str, Any]]] = {
     "SPDM": {"color": LINE_COLORS[1], "marker": "s"},
 }
 """Planners with curves over N_p."""
+_HOLLOW = {"PDM-Closed": 7.0, "SPDM": 4.0}
+"""Sizes of marks for published scores: where two planners have the same, both are to be seen."""
 _WIDTH, _HEIGHT = 7.2, 2.5  # inches
 
 
@@ -75,7 +78,7 @@ def plot_score(panels: Sequence[Panel]) -> Figure:
             quoted = [(n, PUBLISHED.get(name, {}).get(panel.benchmark or "")) for n, name in points]
             known = [(count, float(score[0])) for count, score in quoted if score is not None]
             if known:
-                hollow = {**look, "ls": "none", "mfc": "white", "ms": 4.5}
+                hollow = {**look, "ls": "none", "mfc": "none", "ms": _HOLLOW[planner]}
                 label = f"{planner}, published"
                 axis.plot(*zip(*known, strict=True), label=label, **hollow)
         below = "" if panel.benchmark is None else f"\nhollow: {panel.benchmark}"
@@ -108,6 +111,10 @@ def plot_difference(panels: Sequence[Panel], seed: int = 0) -> Figure:
         suite: sorted({d.kind for p in panels if p.suite == suite for d in found[id(p)]})
         for suite in suites
     }
+    looks = {
+        id(panel): {"color": color, "marker": marker}
+        for panel, color, marker in zip(panels, LINE_COLORS, cycle("os^"), strict=False)
+    }
     longest = max((len(names) for names in kinds.values()), default=0)
     figure = new_figure(_WIDTH, 0.9 + 0.19 * max(longest, 6))
     axes = figure.subplots(1, len(suites), squeeze=False)[0]
@@ -116,21 +123,17 @@ def plot_difference(panels: Sequence[Panel], seed: int = 0) -> Figure:
         for number, panel in enumerate(mine):
             shift = 0.3 * (number - 0.5 * (len(mine) - 1))
             rows = [(kinds[suite].index(d.kind) + shift, d) for d in found[id(panel)]]
-            color, label = LINE_COLORS[number], panel.title
+            look = looks[id(panel)]
             y, mean = [place for place, _ in rows], [d.mean for _, d in rows]
-            axis.hlines(y, [d.low for _, d in rows], [d.high for _, d in rows], color=color, lw=1.0)
-            axis.plot(mean, y, "os"[number % 2], color=color, label=label, ms=3.5)
+            low, high = [d.low for _, d in rows], [d.high for _, d in rows]
+            axis.hlines(y, low, high, color=look["color"], lw=1.0)
+            axis.plot(mean, y, label=panel.title, ls="none", ms=3.5, **look)
         axis.axvline(0, color="#6b7480", lw=0.7)
         axis.set_yticks(range(len(kinds[suite])), [name.replace("_", " ") for name in kinds[suite]])
         axis.set_ylim(len(kinds[suite]) - 0.4, -0.6)
         axis.grid(axis="x")
-        axis.set_xlabel(f"{COMPARED[0]} minus {COMPARED[1]}")
-    handles, labels = [], []
-    for axis in axes:
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            handles.append(handle)
-            labels.append(label)
-    figure.legend(handles, labels, loc="outside upper center", ncols=max(1, len(labels)))
+        axis.set_xlabel("Difference in score")
+    _legend_of(figure, axes, title=f"{COMPARED[0]} minus {COMPARED[1]}")
     return figure
 
 
@@ -145,9 +148,10 @@ def _columns(panels: Sequence[Panel]) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
-def _legend_of(figure: Figure, axes: Sequence[Axes]) -> None:
+def _legend_of(figure: Figure, axes: Sequence[Axes], title: str | None = None) -> None:
     found: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
-    figure.legend(found.values(), found, loc="outside upper center", ncols=max(1, len(found)))
+    columns = max(1, len(found))
+    figure.legend(found.values(), found, loc="outside upper center", ncols=columns, title=title)
