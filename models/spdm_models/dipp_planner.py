@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from spdm_jax.arrays import prefix_sum
+from spdm_jax.config import DT
 from spdm_jax.types import Array
 
 from .gauss_newton import (
@@ -15,15 +17,12 @@ from .gauss_newton import (
     GaussNewtonSolution,
     gauss_newton,
 )
+from .path_frame import PATH_STEP, nearest_point, signed_distance
 
-DT = 0.1
-"""Interval of controls, predictions and trajectories, s."""
 WHEELBASE = 3.089
 """m; nuPlan's Pacifica, as in the reference's bicycle model."""
 MAX_ACCELERATION = 5.0
 """m/s^2; the bicycle model clips controls to it."""
-PATH_STEP = 0.1
-"""Distance of the path's points, m."""
 PATH_NOW = 200
 """Index of the path's point beside the ego at the start."""
 STOP_GAP = 3.0
@@ -182,21 +181,15 @@ def bicycle(
     """
     acceleration = clamp(controls[:, 0], -MAX_ACCELERATION, MAX_ACCELERATION)
     steering = clamp(controls[:, 1], -max_steering, max_steering)
-    speed = clamp(speed + jnp.cumsum(acceleration * DT), 0)
+    speed = clamp(speed + prefix_sum(acceleration * DT), 0)
     slope = jnp.tan(steering) if turn == "tangent" else steering
-    heading = jnp.fmod(heading + jnp.cumsum(speed * slope / WHEELBASE * DT), 2 * jnp.pi)
+    heading = jnp.fmod(heading + prefix_sum(speed * slope / WHEELBASE * DT), 2 * jnp.pi)
     return Motion(
-        x=x + jnp.cumsum(speed * jnp.cos(heading) * DT),
-        y=y + jnp.cumsum(speed * jnp.sin(heading) * DT),
+        x=x + prefix_sum(speed * jnp.cos(heading) * DT),
+        y=y + prefix_sum(speed * jnp.sin(heading) * DT),
         heading=heading,
         speed=speed,
     )
-
-
-def nearest_point(xy: jax.Array, path: jax.Array) -> jax.Array:
-    """Returns `[...]` int32 indices of the path points `[P, >= 2]` nearest to `[..., 2]`."""
-    offset = jax.lax.stop_gradient(xy)[..., None, :] - jax.lax.stop_gradient(path[:, :2])
-    return jnp.argmin(jnp.sum(offset**2, axis=-1), axis=-1)
 
 
 def frenet(xy: jax.Array, path: jax.Array) -> jax.Array:
@@ -211,13 +204,9 @@ def frenet(xy: jax.Array, path: jax.Array) -> jax.Array:
 
     Source: DIPP `project_to_frenet_frame`.
     """
-    xy, path = jax.lax.stop_gradient(xy), jax.lax.stop_gradient(path)
     index = nearest_point(xy, path)
-    point = path[index]
-    dx, dy, heading = xy[..., 0] - point[..., 0], xy[..., 1] - point[..., 1], point[..., 2]
-    side = jnp.sign(dy * jnp.cos(heading) - dx * jnp.sin(heading))
     along = PATH_STEP * (index - PATH_NOW).astype(xy.dtype)
-    return jnp.stack([along, side * jnp.sqrt(dx**2 + dy**2)], axis=-1)
+    return jnp.stack([along, signed_distance(xy, path, index)], axis=-1)
 
 
 def residuals(
@@ -235,7 +224,7 @@ def residuals(
     the sample itself (the reference takes the first sample's choice for the whole batch).
     """
     acceleration, steering = controls[:, 0], controls[:, 1]
-    unclipped = clamp(problem.speed + jnp.cumsum(acceleration * DT), 0)
+    unclipped = clamp(problem.speed + prefix_sum(acceleration * DT), 0)
     motion = bicycle(
         controls,
         problem.x,
@@ -264,7 +253,7 @@ def _red_light_violation(speed: jax.Array, path_info: jax.Array) -> jax.Array:
     red = path_info[PATH_NOW:] == 0
     first = jnp.argmax(red)
     stop = PATH_STEP * first.astype(speed.dtype) - STOP_GAP
-    driven = jnp.cumsum(speed * DT)
+    driven = prefix_sum(speed * DT)
     # A light at the very first point counts as none, as does no light at all.
     return jnp.where((driven > stop) & (first > 0), driven - stop, 0)
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from spdm_jax.arrays import prefix_sum
-from spdm_jax.geometry import Box, boxes_overlap, segment_box_distance
+from spdm_jax.geometry import Box, box_distance, boxes_overlap, segment_box_distance
 
 POINT_SPACING = 0.25
 """Distance between points of a centre line, m."""
@@ -201,10 +201,43 @@ def swept_path_hits(
     Returns:
       `[A]` bool.
     """
+    near, caps = _swept_parts(x, y, count, boxes)
+    hit = jnp.min(near, axis=1) <= EGO_HALF_WIDTH
+    for cap in caps:
+        hit = hit | (boxes_overlap(cap, boxes) & (count > 1))
+    return present & hit
+
+
+def swept_path_distance(
+    x: jax.Array, y: jax.Array, count: jax.Array, boxes: Box, present: jax.Array
+) -> jax.Array:
+    """Distance of the strip that the ego sweeps along a path to each box.
+
+    Args:
+      x: `[M]` m.
+      y: `[M]` m.
+      count: `[]` real points.
+      boxes: `[A]` boxes.
+      present: `[A]` bool.
+
+    Returns:
+      `[A]` m, 0 where they meet, inf where no box is present.
+    """
+    near, caps = _swept_parts(x, y, count, boxes)
+    distance = jnp.maximum(jnp.min(near, axis=1) - EGO_HALF_WIDTH, 0)
+    for cap in caps:
+        to_cap = jnp.where(count > 1, box_distance(cap, boxes), jnp.inf)
+        distance = jnp.minimum(distance, to_cap)
+    return jnp.where(present, distance, jnp.inf)
+
+
+def _swept_parts(
+    x: jax.Array, y: jax.Array, count: jax.Array, boxes: Box
+) -> tuple[jax.Array, tuple[Box, Box]]:
+    """Distances of the path's segments to boxes `[A, M - 1]`, and the strip's two end caps."""
     real = jnp.arange(x.shape[0] - 1) + 1 < count
-    ax, ay, bx, by = x[:-1], y[:-1], x[1:], y[1:]
     each = jax.tree.map(lambda v: jnp.atleast_1d(v)[:, None], boxes)
-    near = segment_box_distance(ax, ay, bx, by, each) <= EGO_HALF_WIDTH
+    near = segment_box_distance(x[:-1], y[:-1], x[1:], y[1:], each)
 
     def end_cap(tip, inner):
         dx, dy = x[tip] - x[inner], y[tip] - y[inner]
@@ -215,8 +248,8 @@ def swept_path_hits(
         return Box(x[tip] + half * cos, y[tip] + half * sin, cos, sin, half, 2 * half)
 
     last = jnp.maximum(count - 1, 1)
-    caps = boxes_overlap(end_cap(0, 1), boxes) | boxes_overlap(end_cap(last, last - 1), boxes)
-    return present & (jnp.any(near & real, axis=1) | (caps & (count > 1)))
+    caps = end_cap(0, 1), end_cap(last, last - 1)
+    return jnp.where(real, near, jnp.inf), caps
 
 
 def spline_course(x: jax.Array, y: jax.Array, count: jax.Array, num_rows: int = NUM_ROWS) -> Course:

@@ -20,6 +20,7 @@ from .metrics import check_metrics  # noqa: E402
 from .models_dipp import check_dipp  # noqa: E402
 from .models_dtpp import check_dtpp  # noqa: E402
 from .models_gameformer import check_gameformer  # noqa: E402
+from .models_gameformer_planner import check_gameformer_planner  # noqa: E402
 from .pdm import check_scene, check_scorer  # noqa: E402
 from .planning import check_planning  # noqa: E402
 from .report import Report  # noqa: E402
@@ -64,7 +65,7 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
     }
     # Told apart by the description beside the arrays; several may look at one file.
     by_description = (check_metrics, check_simulation)
-    by_model = (check_dipp, check_dtpp, check_gameformer)
+    by_model = (check_dipp, check_dtpp, check_gameformer, check_gameformer_planner)
     for path in sorted(folder.rglob("*")):
         if not path.is_file() or only not in path.name:
             continue
