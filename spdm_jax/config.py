@@ -158,6 +158,8 @@ class PlannerConfig:
       forecast: where the agents' future comes from. "reactive" asks a simulation whose traffic
         reacts how it would beside each proposal; anywhere else it is "perfect".
       progress_reference: "auto" is the centreline for K = 0 and the goal path otherwise.
+      borrow_oncoming: whether stage 2 may pass a standing obstacle through the oncoming lane, an
+        extension of ours (see `spdm_jax.proposals.borrow`); does nothing for K = 0.
       max_vehicles: nearest vehicles kept per step; likewise the three fields that follow.
       max_pedestrians: see above.
       max_bicycles: see above.
@@ -171,6 +173,7 @@ class PlannerConfig:
     tracker: Tracker = "reference"
     forecast: ForecastMode = "constant_velocity"
     progress_reference: ProgressReference = "auto"
+    borrow_oncoming: bool = False
     max_vehicles: int = 50
     max_pedestrians: int = 25
     max_bicycles: int = 10
@@ -189,6 +192,11 @@ class PlannerConfig:
         ):
             if value not in allowed:
                 raise ValueError(f"{name} is {value!r}; it must be one of {allowed}")
+
+    @property
+    def borrows(self) -> bool:
+        """Whether there are paths through the oncoming lane."""
+        return self.borrow_oncoming and self.num_route_paths > 0
 
     @property
     def max_objects(self) -> int:

@@ -28,9 +28,10 @@ from spdm_jax.config import (
 )
 from spdm_jax.geometry import Path, ego_box, interpolate, project
 from spdm_jax.proposals import idm
+from spdm_jax.proposals.borrow import Surroundings, drive_borrowing
 from spdm_jax.proposals.spline import RouteLanePaths, drive
 from spdm_jax.scoring.areas import AreaMasks
-from spdm_jax.scoring.driving import progress
+from spdm_jax.scoring.driving import METRIC_WINDOW, progress
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import track
 from spdm_jax.types import AgentForecast, EgoState, PolygonGrid, ProposalSet, SubScores
@@ -247,6 +248,7 @@ def decide(
     params: PlannerParams,
     config: PlannerConfig,
     reacting: Callable[[EgoState], AgentForecast] | None = None,
+    around: Surroundings | None = None,
 ) -> Decision:
     """Proposes, tracks, scores and chooses on given paths.
 
@@ -263,13 +265,19 @@ def decide(
       config: static settings.
       reacting: how the objects of `seen` would move beside each tracked proposal `[P, T]`; scores
         alone ask for it.
+      around: what borrowing the oncoming lane depends on, or None. Where it is given, proposals are
+        judged by the final metric's rule for driving against traffic.
     """
     vehicle = params.vehicle
     with jax.named_scope("propose"):
         stage1 = stage1_proposals(paths, ego, target_speed, seen, params)
         stage2 = None
         if route_paths is not None:
-            stage2 = drive(route_paths, ego, target_speed, params.spline, NUM_TRAJECTORY_STATES)
+            given, steps = (route_paths, ego, target_speed), NUM_TRAJECTORY_STATES
+            if around is None:
+                stage2 = drive(*given, params.spline, steps)
+            else:
+                stage2 = drive_borrowing(*given, params, steps, around)
         proposals = merge(stage1, stage2, route_paths)
     with jax.named_scope("track"):
         reference = (proposals.x, proposals.y, proposals.heading)
@@ -277,7 +285,10 @@ def decide(
     with jax.named_scope("score"):
         forecast = seen.forecast if reacting is None else reacting(tracked)
         world = World(grid, masks, forecast, progress_path)
-        scores = score_trajectories(tracked, proposals.valid, world, vehicle, params.scoring)
+        window = None if around is None else METRIC_WINDOW
+        scores = score_trajectories(
+            tracked, proposals.valid, world, vehicle, params.scoring, window
+        )
     with jax.named_scope("choose"):
         best = jnp.argmax(scores.total).astype(jnp.int32)
         braking = (scores.collision_time[best] <= params.brake.time_threshold) & (

@@ -20,6 +20,7 @@ from spdm_jax.agents.observation import Observation, red_lights, select_objects
 from spdm_jax.config import NUM_TRAJECTORY_STATES, PlannerConfig, PlannerParams
 from spdm_jax.decision import Seen, cast_params, decide, notice, progress_of, target_speeds
 from spdm_jax.geometry import Path, ego_box, point_segment_sq
+from spdm_jax.proposals.borrow import Surroundings, surroundings
 from spdm_jax.proposals.lanes import (
     area_masks,
     drivable_lanes,
@@ -29,6 +30,7 @@ from spdm_jax.proposals.lanes import (
     sequence_path,
     starting_lane,
 )
+from spdm_jax.proposals.oncoming import oncoming_lane
 from spdm_jax.proposals.spline import route_lane_paths
 from spdm_jax.types import AgentForecast, Array, EgoState, ProposalSet, Scenario, SubScores
 
@@ -250,6 +252,21 @@ def _follow_lane_change(
     )
 
 
+def _around(
+    scene: Scenario,
+    given: StepInput,
+    state: PlannerState,
+    params: PlannerParams,
+    config: PlannerConfig,
+) -> Surroundings:
+    """Looks for an oncoming lane to borrow and for what borrowing it depends on."""
+    centerline = jax.tree.map(lambda v: v[0], state.paths)
+    lane = oncoming_lane(
+        scene.map.lanes, scene.route, centerline, given.ego, config.max_path_points
+    )
+    return surroundings(lane, centerline, given.ego, given.observation, params)
+
+
 def step(
     scene: Scenario,
     given: StepInput,
@@ -284,10 +301,11 @@ def step(
         masks = area_masks(scene.map, scene.route.lane_on_route, lanes, parks)
     target_speed = target_speeds(scene.map.lanes.speed_limit[lane], params)
 
-    route_paths = None
+    route_paths = around = None
     if config.num_route_paths:
         with jax.named_scope("route_lanes"):
             state = _follow_lane_change(scene, state, ego, params, config)
+            around = _around(scene, given, state, params, config) if config.borrows else None
             route_paths = route_lane_paths(
                 scene.map.lanes,
                 scene.route,
@@ -299,6 +317,7 @@ def step(
                 params.spline,
                 config.num_route_paths,
                 config.max_path_points,
+                None if around is None else around.oncoming,
             )
     centerline = jax.tree.map(lambda v: v[0], state.paths)
     by_goal = config.progress_reference == "goal" or (
@@ -325,6 +344,7 @@ def step(
         params,
         config,
         None if react is None else reacting,
+        around,
     )
     tracked, raw = decision.tracked, decision.scores.progress_raw
     other = progress_of(tracked, centerline if by_goal else state.goal, params.vehicle)

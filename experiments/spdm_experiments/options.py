@@ -63,6 +63,8 @@ class Planner(Compute):
     progress_reference: Literal["auto", "centerline", "goal"] = "auto"
     """What progress is measured along: the centreline (as published), the way to the goal, or the
     first for PDM-Closed and the second for SPDM (auto)."""
+    borrow_oncoming: bool = False
+    """Let SPDM pass a standing obstacle through the oncoming lane."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,6 +289,8 @@ class Simulate(OverGrid):
     """Where PDM-Closed and SPDM take the other agents' future from."""
     progress: tuple[Literal["auto", "centerline", "goal"], ...] = ()
     """What PDM-Closed and SPDM measure progress along; see spdm plan --progress-reference."""
+    borrow_oncoming: tuple[Literal["no", "yes"], ...] = ()
+    """Whether SPDM may pass a standing obstacle through the oncoming lane (no if left out)."""
     replan_every: int = 1
     """Steps of 0.1 s between two plans."""
     record: Literal["none", "history", "plans"] = "none"

@@ -19,6 +19,7 @@ def make_planner(options: Planner) -> PlannerSpec:
         tracker=options.tracker,
         forecast=options.forecast,
         progress_reference=options.progress_reference,
+        borrow_oncoming=options.borrow_oncoming,
     )
     grid: dict[str, Any] = {}
     if options.speeds:

@@ -19,7 +19,7 @@ NAMES = {
 }
 """Planners of the command line, and how tables call them."""
 _PROPOSERS = ("spdm", "pdm-closed")
-_SETTINGS: tuple[str, ...] = ("forecast", "progress_reference")
+_SETTINGS: tuple[str, ...] = ("forecast", "progress_reference", "borrow_oncoming")
 """What PDM-Closed and SPDM can be asked for; the other planners have no such thing."""
 
 
@@ -88,10 +88,14 @@ def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Ite
         "num_proposals": options.num_proposals,
         "forecast": options.forecast,
         "progress_reference": options.progress,
+        # PDM-Closed has no paths that could.
+        "borrow_oncoming": [v == "yes" for v in options.borrow_oncoming if planner == "spdm"],
     }
     given = {name: values for name, values in axes.items() if values}
     for values in product(*given.values()):
         made = point_of({"planner": planner, **dict(zip(given, values, strict=True))})
-        settings = {name: made.settings[name] for name in _SETTINGS}
         spec = made.spec
+        settings = {name: made.settings.get(name) for name in _SETTINGS}
+        if planner == "spdm":
+            settings["borrow_oncoming"] = "yes" if spec.config.borrow_oncoming else "no"
         yield Point(planner, made.num_proposals, traffic, mode, settings, spec.config, spec.params)

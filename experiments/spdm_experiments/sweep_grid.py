@@ -34,6 +34,7 @@ _AXES: dict[str, type] = {
     "tracker": str,
 }
 """Axes of a grid in the order in which points are numbered, and what one value is."""
+_SWITCHES = ("tracker", "forecast", "progress_reference", "borrow_oncoming")
 _OWN_OPTION = {
     "speed_fractions": "--speeds",
     "lateral_offsets": "--offsets",
@@ -289,9 +290,7 @@ def point_of(chosen: Mapping[str, Any], swept: Sequence[str] = ()) -> Point:
       ValueError: planner and settings do not fit.
     """
     short = chosen.get("planner", "spdm")
-    config = PlannerConfig(
-        **{n: chosen[n] for n in ("tracker", "forecast", "progress_reference") if n in chosen}
-    )
+    config = PlannerConfig(**{n: chosen[n] for n in _SWITCHES if n in chosen})
     asked = chosen.get("num_proposals")
     own = {"speeds": "speed_fractions", "offsets": "lateral_offsets"}
     lists = {own[name]: chosen[name] for name in own if name in chosen}

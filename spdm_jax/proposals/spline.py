@@ -9,10 +9,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from spdm_jax.arrays import order_of, prefix_sum
+from spdm_jax.arrays import order_of, prefix_sum, rank_of
 from spdm_jax.config import DT, SplineParams
 from spdm_jax.geometry import Path, interpolate, make_path, project, unwrap_masked, wrap
 from spdm_jax.proposals.lanes import sequence_path
+from spdm_jax.proposals.oncoming import OncomingLane, lateral_offset
 from spdm_jax.types import EgoState, Lanes, Route
 
 CURVE_POINTS = 65
@@ -30,12 +31,14 @@ class RouteLanePaths(NamedTuple):
       valid: `[K]` bool.
       lane: `[K]` int32 first lane of the branch, -1 where invalid.
       overflow: `[]` bool, a path did not fit its buffer.
+      borrowed: `[K]` bool, the path is the oncoming lane's; None where none is offered.
     """
 
     path: Path
     valid: jax.Array
     lane: jax.Array
     overflow: jax.Array
+    borrowed: jax.Array | None = None
 
 
 def bezier(
@@ -152,9 +155,9 @@ def _candidates(
 
     # Lateral position of each branch relative to the centreline, beside the ego.
     x, y, _ = jax.vmap(interpolate)(path, at)
-    offset = _signed_offset(centerline, x, y)
+    offset = lateral_offset(centerline, x, y)
     goal_x, goal_y, _ = interpolate(goal, project(goal, ego.x, ego.y))
-    goal_offset = _signed_offset(centerline, goal_x, goal_y)
+    goal_offset = lateral_offset(centerline, goal_x, goal_y)
     to_goal = jnp.where(jnp.abs(goal_offset) > 0.5, jnp.sign(goal_offset), 0)
     goal_side = (to_goal != 0) & (jnp.sign(offset) == to_goal)
     # Half-metre steps, so that equal lanes left and right do not swap by rounding; left first.
@@ -163,10 +166,19 @@ def _candidates(
     return _Candidates(path, at, first, own, usable, key, jnp.any(overflow & usable))
 
 
-def _signed_offset(path: Path, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Lateral offset of points from a path, left positive."""
-    px, py, heading = interpolate(path, project(path, x, y))
-    return (y - py) * jnp.cos(heading) - (x - px) * jnp.sin(heading)
+def _with_oncoming(found: _Candidates, oncoming: OncomingLane) -> _Candidates:
+    """Adds the oncoming lane as a last branch, which starts beside the ego."""
+    more = _Candidates(
+        path=oncoming.path,
+        at=jnp.zeros_like(oncoming.path.length),
+        lane=oncoming.lane,
+        own=jnp.bool_(False),
+        usable=oncoming.usable,
+        key=jnp.zeros((), found.key.dtype),
+        overflow=found.overflow,
+    )
+    join = lambda a, b: jnp.concatenate([a, b[None]]) if a.ndim > b.ndim else a
+    return jax.tree.map(join, found, more)
 
 
 def route_lane_paths(
@@ -180,12 +192,18 @@ def route_lane_paths(
     params: SplineParams,
     num_paths: int,
     max_points: int,
+    oncoming: OncomingLane | None = None,
 ) -> RouteLanePaths:
     """Builds the K paths of stage 2 in their fixed order.
 
     Order: lanes other than the centreline's before its own; merge distance outermost (4 s, 2 s, 6
     s); within it the goal side first, then by lateral distance from the centreline. A smaller K is
     a prefix of a larger one.
+
+    The oncoming lane, where one is given, comes between the two: after lanes on which one drives
+    the right way, and before the own lane, to which stage 1 leads back as well, so that on a road
+    with one lane per direction K = 1 already holds it. Its shortest merge distance comes first:
+    it is entered slowly, close to what blocks the own lane.
 
     Args:
       lanes: lane table.
@@ -198,11 +216,14 @@ def route_lane_paths(
       params: merge distances.
       num_paths: K.
       max_points: room for a branch's points.
+      oncoming: lane to borrow, or None.
 
     Returns:
       `RouteLanePaths`; rows beyond the available lanes x merge distances are masked.
     """
     found = _candidates(lanes, route, slot, block, centerline, goal, ego, max_points)
+    if oncoming is not None:
+        found = _with_oncoming(found, oncoming)
     merge_times = jnp.asarray(params.merge_times, ego.x.dtype)
     num_merges, num_branches = merge_times.shape[0], found.lane.shape[0]
     distance = jnp.clip(
@@ -215,7 +236,13 @@ def route_lane_paths(
     reach = found.at[branch] + distance[merge]
     fits = reach < found.path.length[branch]
     usable = found.usable[branch] & fits
-    rank = order_of(branch, found.key[branch], merge, found.own[branch], ~usable)
+    if oncoming is None:
+        rank = order_of(branch, found.key[branch], merge, found.own[branch], ~usable)
+    else:
+        borrowed = branch == num_branches - 1
+        group = jnp.where(borrowed, 1, jnp.where(found.own[branch], 2, 0))
+        turn = jnp.where(borrowed, rank_of(distance)[merge], merge)
+        rank = order_of(branch, found.key[branch], turn, group, ~usable)
     chosen = rank[:num_paths]
     if chosen.shape[0] < num_paths:
         chosen = jnp.pad(chosen, (0, num_paths - chosen.shape[0]), constant_values=rank[-1])
@@ -241,6 +268,7 @@ def route_lane_paths(
         valid=valid,
         lane=jnp.where(valid, found.lane[branch[chosen]], -1).astype(jnp.int32),
         overflow=found.overflow,
+        borrowed=None if oncoming is None else valid & (branch[chosen] == num_branches - 1),
     )
 
 

@@ -80,6 +80,7 @@ def score_trajectories(
     world: World,
     vehicle: VehicleParams,
     params: ScoringParams,
+    direction_window: int | None = None,
 ) -> SubScores:
     """Scores tracked proposals.
 
@@ -89,6 +90,7 @@ def score_trajectories(
       world: the scene at this step.
       vehicle: ego dimensions.
       params: weights and thresholds.
+      direction_window: of `driving_direction`; None is the published rule.
 
     Returns:
       `SubScores` `[P]`.
@@ -108,7 +110,7 @@ def score_trajectories(
         flags = comfort_flags(ego, params)
     comfort = jnp.all(flags, axis=-1).astype(ego.x.dtype)
     drivable = jnp.where(jnp.any(areas.non_drivable, axis=-1), 0.0, 1.0).astype(ego.x.dtype)
-    direction = driving_direction(box.x, box.y, areas.oncoming, params)
+    direction = driving_direction(box.x, box.y, areas.oncoming, params, direction_window)
     combined = aggregate(
         collision.score * drivable * direction, raw, ttc.score, comfort, valid, params
     )
