@@ -149,6 +149,8 @@ def test_every_suite_has_the_planners_of_the_tables(suite: Suite):
     assert names >= PUBLISHED.keys() | set(COMPARED)
     assert names >= {f"PDM-Closed {count}" for count in (1, 3, 6, 15, 30, 60)}
     assert "SPDM 30, progress along the centreline" in names and "Constant velocity" in names
+    borrows = "SPDM 60, may borrow the oncoming lane"
+    assert (borrows in names) == (suite.name == "interactive-8")
     for traffic in suite.traffic:
         assert {name_of(p) for p in points if p["traffic"] == traffic} == names
     again = dataclasses.replace(suite, lineup=PRECISION_LINEUP).points()

@@ -19,6 +19,12 @@ LINEUP: Final[tuple[Mapping[str, Any], ...]] = (
     {"planner": ("idm", "idm-mobil", "constant-velocity", "log-replay")},
 )
 """Options of `spdm simulate`, one entry per product of planners and settings."""
+BORROWING: Final[Mapping[str, Any]] = {
+    "planner": ("spdm",),
+    "num_proposals": (60,),
+    "borrow_oncoming": ("yes",),
+}
+"""An extension of SPDM, driven where a lane may be blocked."""
 WORDS: Final = {
     ("progress_reference", "centerline"): "progress along the centreline",
     ("borrow_oncoming", "yes"): "may borrow the oncoming lane",
@@ -82,7 +88,7 @@ class Suite:
 
 SUITES: Final = (
     Suite("common-14", Path("common-14"), ("replay", "reactive")),
-    Suite("interactive-8", Path("interactive-8"), ("reactive",)),
+    Suite("interactive-8", Path("interactive-8"), ("reactive",), (*LINEUP, BORROWING)),
 )
 """What the page shows, in its order."""
 PRECISION_LINEUP: Final[tuple[Mapping[str, Any], ...]] = (
