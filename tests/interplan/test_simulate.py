@@ -28,7 +28,7 @@ from spdm_experiments.simulate_scripts import (
     scripts_of,
     verdicts_of,
 )
-from spdm_jax.batching import group_by_shape
+from spdm_jax.batching import group_by_shape, leaf_type
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.interplan.extras import extras_path, write_extras
 from spdm_jax.interplan.modification_file import modifications_from
@@ -50,11 +50,11 @@ DETAILS = {
     "special_scenario": {
         "0": {
             "type": "jaywalking_pedestrian",
-            "pedestrian": [[EGO_FRONT + 8.0, LANE_1, EGO_FRONT + 8.0, 5.0, None]],
+            "pedestrian": [[EGO_FRONT + 8.0, LANE_1, EGO_FRONT + 8.0, LANE_1 + 1, None]],
         },
         "1": {
             "type": "nudge_around_parked_vehicle",
-            "config": "ocgs",
+            "config": "oc",
             "stopped_vehicle": [[68.0, 0.0, 0.0]],
         },
     },
@@ -232,18 +232,18 @@ def test_drives_follow_the_script(whole: Path):
     assert all(plain[name] is None for name in own) and plain["samples"] == 19
     # The drive ends before the step past the goal.
     ends = int(GOAL - 0.1 - (roads.EGO_X + 1.461)) + 1
-    assert goal["samples"] == parked["samples"] == ends < walker["samples"]
-    assert goal["lane_changes_to_goal"] == 1 and goal["ego_sorts_stopped_vehicle"] is None
-    terms = sum(w * goal[n] for w, n in zip((5, 5, 4, 2), SCORED[4:], strict=True))
-    gates = np.prod([goal[name] for name in SCORED[:4]])
-    assert goal["interplan_score"] == pytest.approx(gates * (terms + 4) / 20, abs=1e-5)
-    assert goal["score"] == pytest.approx(gates * terms / 16, abs=1e-5)
+    assert goal["samples"] == ends and goal["ego_sorts_stopped_vehicle"] is None
+    assert goal["lane_changes_to_goal"] == 1
     # The pedestrian is no more than a script, and it is there to be hit.
     assert walker["collision_object"] == "pedestrian-0"
     assert walker["collision_time"] == pytest.approx(0.8, abs=0.11)
     assert walker["interplan_score"] == 0
-    assert parked["scenario_type"] == "nudge_around_parked_vehicle"
-    assert parked["ego_sorts_stopped_vehicle"] == 1
+    # Without a goal of its own a drive ends where the recorded one did, 0.1 m short.
+    assert parked["scenario_type"] == "nudge_around_parked_vehicle" and parked["samples"] == 18
+    assert parked["ego_sorts_stopped_vehicle"] == parked["driving_direction_compliance"] == 1
+    terms = sum(w * parked[n] for w, n in zip((5, 5, 4, 2), SCORED[4:], strict=True))
+    assert parked["interplan_score"] == pytest.approx((terms + 4 + 1) / 21, abs=1e-5)
+    assert parked["score"] == pytest.approx(terms / 16, abs=1e-5) and terms < 16
 
 
 @pytest.mark.slow
@@ -278,7 +278,7 @@ def test_room_and_neighbours_change_nothing(folder: Path, whole: Path):
         num_iterations=20,
     )
     single = lambda tree: jax.tree.map(
-        lambda v: np.asarray(v, np.float32) if v.dtype == np.float64 else v, tree
+        lambda v: np.asarray(v, leaf_type(np.asarray(v), np.dtype(np.float32))), tree
     )
     mapped = jax.jit(jax.vmap(partial(run_scene, static=switches), in_axes=(0, 0, None)))
     result = mapped(single(scenes.batch), single(scripts), single(PlannerParams()))
