@@ -89,6 +89,7 @@ def record(
     log_name: str = "synthetic",
     num_iterations: int = NUM_ITERATIONS,
     num_steps: int = NUM_STEPS,
+    remember_static: bool = False,
 ) -> RawScenario:
     """Draws place and direction of a scene, sets its stage and records what happens on it.
 
@@ -100,11 +101,20 @@ def record(
       log_name: likewise.
       num_iterations: likewise.
       num_steps: recorded steps in all.
+      remember_static: see `simulate`.
     """
     angle = rng.uniform(-np.pi, np.pi)
     origin = np.array(ORIGIN) + np.round(rng.uniform(-2000.0, 2000.0, 2), 1)
     stage = scene(rng)
-    ego, tracks = simulate(stage.ego, stage.followers, stage.scripted, stage.lights, rng, num_steps)
+    ego, tracks = simulate(
+        stage.ego,
+        stage.followers,
+        stage.scripted,
+        stage.lights,
+        rng,
+        num_steps,
+        remember_static,
+    )
     goal = stage.builder.lanes[stage.route[-1]].centerline[-1]
 
     frame = _Frame(float(angle), origin)

@@ -91,6 +91,8 @@ class SuiteReader:
                 log_name=self._suite,
                 num_iterations=num_iterations,
                 num_steps=NUM_HISTORY + num_iterations - 1 + NUM_BEYOND,
+                # What blocks the way of an ego that waits must not vanish with the recorded one.
+                remember_static=True,
             )
             if not faults(raw):
                 return raw

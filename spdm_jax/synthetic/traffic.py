@@ -120,6 +120,7 @@ def simulate(
     lights: dict[str, np.ndarray],
     rng: np.random.Generator,
     num_steps: int = NUM_STEPS,
+    remember_static: bool = False,
 ) -> tuple[np.ndarray, RawTracks]:
     """Runs the traffic of one scene.
 
@@ -131,6 +132,7 @@ def simulate(
       lights: connector -> `[T]` `LightStatus`, at least as long as the run.
       rng: source of the drivers' imperfection.
       num_steps: T, recorded steps.
+      remember_static: whether an object that is no agent stays on record once the ego has seen it.
 
     Returns:
       The ego's `[T, 11]` states in nuPlan's column order, and the tracks (order of first
@@ -143,7 +145,7 @@ def simulate(
         noise = 0.9 * noise + 0.05 * rng.standard_normal(len(noise))
         noise[0] = 0.0
         traffic.advance(step, noise)
-    return traffic.ego_states(), traffic.tracks()
+    return traffic.ego_states(), traffic.tracks(remember_static)
 
 
 class _Traffic:
@@ -352,7 +354,7 @@ class _Traffic:
         ]
         return np.column_stack(columns)
 
-    def tracks(self) -> RawTracks:
+    def tracks(self, remember_static: bool) -> RawTracks:
         """Returns what the ego observes, in order of first appearance; other entries are zero."""
         rows = self.network.index[1:, None]
         everyone = np.broadcast_to(np.arange(len(self.drivers))[:, None], self.station.shape)
@@ -362,6 +364,9 @@ class _Traffic:
         size = 2.0 * np.concatenate([self.half[1:], self.script_half])
         valid = np.linalg.norm(pose[..., :2] - center[0, :, :2], axis=-1) < OBSERVED_RANGE
         valid[: len(rows)] &= self.station[1:] <= self.network.length[rows]
+        if remember_static:
+            static = self.types > ObjectType.BICYCLE
+            valid[static] = np.logical_or.accumulate(valid[static], axis=1)
 
         seen = np.flatnonzero(valid.any(axis=1))
         order = seen[np.argsort(valid[seen].argmax(axis=1), kind="stable")]
