@@ -228,7 +228,8 @@ def near_multiple_vehicles(rng: np.random.Generator) -> Stage:
     stage, path = _on_corridor(
         rng, _winding(rng), lanes=3, oncoming=2, speed=speed, limit=13.4, lane=1
     )
-    fill_lanes(rng, stage, 3, 2, 15.0, speed, desired_speed=1.2 * speed)
+    fill_lanes(rng, stage, 3, 0, 15.0, speed, desired_speed=1.2 * speed)
+    fill_oncoming(rng, stage, 2, 65.0, speed)
     roadside(rng, stage, path, 3, 2)
     stage.ego = expert(stage.ego)
     return stage
