@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 
 from spdm_jax.types import Array
@@ -53,12 +54,6 @@ class PlannerLoss(struct.PyTreeNode, kw_only=True):
     trajectory: Array
 
 
-def smooth_l1(value: jax.Array, target: jax.Array) -> jax.Array:
-    """Returns the mean Huber loss with its corner at 1, as torch's `smooth_l1_loss`."""
-    error = jnp.abs(value - target)
-    return jnp.mean(jnp.where(error < 1, 0.5 * error**2, error - 0.5))
-
-
 def plan_trajectories(controls: jax.Array, ego: jax.Array) -> jax.Array:
     """Drives controls from where the ego is.
 
@@ -99,7 +94,7 @@ def future_loss(
     best = jnp.argmin(jax.lax.stop_gradient(distance), axis=-1)
     chosen = pick(futures, best)
     agents = truth.shape[1]
-    motion = smooth_l1(chosen, truth) + smooth_l1(chosen[:, :, -1], truth[:, :, -1])
+    motion = _mean_huber(chosen, truth) + _mean_huber(chosen[:, :, -1], truth[:, :, -1])
     picked = jnp.take_along_axis(jax.nn.log_softmax(scores), best[:, None], axis=1)
     return FutureLoss(total=0.5 * agents * motion - jnp.mean(picked), best_mode=best)
 
@@ -145,8 +140,8 @@ def planner_loss(
     refined, trajectory, objective = jax.vmap(refine)(
         controls, ego, neighbors, predictions, ref_line
     )
-    plan = smooth_l1(trajectory, truth[:, 0, :, :3])
-    plan = plan + smooth_l1(trajectory[:, -1], truth[:, 0, -1, :3])
+    plan = _mean_huber(trajectory, truth[:, 0, :, :3])
+    plan = plan + _mean_huber(trajectory[:, -1], truth[:, 0, -1, :3])
     cost = 2 * jnp.mean(objective) / config.num_residuals
     return PlannerLoss(
         total=futures.total + plan + PLAN_COST_FACTOR * cost,
@@ -178,6 +173,10 @@ def motion_metrics(plan: jax.Array, predictions: jax.Array, truth: jax.Array) ->
     mean = jnp.sum(jnp.where(counts, jnp.mean(predicted, axis=-1), 0)) / number
     last = jnp.sum(jnp.where(counts, predicted[..., -1], 0)) / number
     return jnp.stack([jnp.mean(planned), jnp.mean(planned[:, -1]), mean, last])
+
+
+def _mean_huber(value: jax.Array, target: jax.Array) -> jax.Array:
+    return jnp.mean(optax.losses.huber_loss(value, target))
 
 
 def _seen(predictions: jax.Array, truth: jax.Array) -> jax.Array:
