@@ -20,7 +20,7 @@ from spdm_jax.agents.observation import Observation, red_lights, select_objects
 from spdm_jax.config import NUM_TRAJECTORY_STATES, PlannerConfig, PlannerParams
 from spdm_jax.decision import Seen, cast_params, decide, notice, progress_of, target_speeds
 from spdm_jax.geometry import Path, ego_box, point_segment_sq
-from spdm_jax.proposals.borrow import Surroundings, surroundings
+from spdm_jax.proposals.borrow import Surroundings, offered, surroundings
 from spdm_jax.proposals.lanes import (
     area_masks,
     drivable_lanes,
@@ -317,7 +317,7 @@ def step(
                 params.spline,
                 config.num_route_paths,
                 config.max_path_points,
-                None if around is None else around.oncoming,
+                None if around is None else offered(around),
             )
     centerline = jax.tree.map(lambda v: v[0], state.paths)
     by_goal = config.progress_reference == "goal" or (

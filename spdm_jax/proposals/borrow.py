@@ -120,6 +120,15 @@ def surroundings(
     )
 
 
+def offered(around: Surroundings) -> OncomingLane:
+    """The oncoming lane as a branch of stage 2: usable only where something blocks the own one.
+
+    Elsewhere, and once the ego is past, all K paths are those of route lanes, the way back too.
+    """
+    lane = around.oncoming
+    return lane._replace(usable=lane.usable & around.blocked)
+
+
 def overhangs(vehicle: VehicleParams) -> tuple[jax.Array, jax.Array]:
     """Distances from the rear axle to the rear and to the front bumper, m."""
     half = 0.5 * vehicle.length
