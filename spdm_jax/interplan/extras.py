@@ -106,6 +106,8 @@ def read_extras(path: Path | str) -> InterplanExtras:
             for entry in entries.pop("pedestrians")
         )
         points = {key: tuple(map(tuple, entries.pop(key))) for key in ("obstacles", "course")}
+        if (kind is None) != (not points["obstacles"]) or not points["course"]:
+            raise ValueError(f"obstacle_kind {kind!r} without obstacles, or no course")
         names = {key: tuple(entries.pop(key)) for key in ("stopped", "cautious")}
         return InterplanExtras(
             policy=Policy(entries.pop("policy")),

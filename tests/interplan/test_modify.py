@@ -391,6 +391,9 @@ def test_extras_survive_a_file(tmp_path: Path):
         found = read_extras(path)
         assert found == record and isinstance(found, InterplanExtras)
         assert isinstance(found.policy, Policy)
+    write_extras(path, dataclasses.replace(extras, obstacles=()))
+    with pytest.raises(ScenarioError, match="'ego_sorts_jaywalking_pedestrian' without obstacles"):
+        read_extras(path)
     path.write_text('{"name": "x"}')
     with pytest.raises(ScenarioError, match="no record of an interPlan scenario"):
         read_extras(path)
