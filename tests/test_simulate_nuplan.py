@@ -79,7 +79,7 @@ def test_filters_and_modifications_become_scores(shared: Path, tmp_path: Path, c
 
     drive = ["simulate", str(packed), "--out", str(out), "--planner", "pdm-closed"]
     assert cli.main([*drive, "--num-proposals", "1", "--by-type"]) == 0
-    told = capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())  # narrow terminals wrap titles
     assert "scored by interPlan" in told and "Mean interplan_score by scenario type" in told
     rows = polars.read_parquet(out / "rows" / "part-*.parquet").sort("token")
     plain, changed = rows.iter_rows(named=True)
@@ -88,6 +88,5 @@ def test_filters_and_modifications_become_scores(shared: Path, tmp_path: Path, c
     assert plain["interplan_score"] is None and plain["score"] > 0.5
     # PDM-Closed leaves its lane for nobody: it stands behind the parked car.
     assert changed["scenario_type"] == "nudge_around_parked_vehicle"
-    assert changed["ego_sorts_stopped_vehicle"] in (0.0, 1.0)
-    assert changed["lane_changes_to_goal"] == 1.0 and 0 <= changed["interplan_score"] <= 1
-    assert changed["no_ego_at_fault_collisions"] == 1.0
+    assert changed["ego_sorts_stopped_vehicle"] == changed["interplan_score"] == 0
+    assert changed["lane_changes_to_goal"] == 1 and changed["score"] > 0.5
