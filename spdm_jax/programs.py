@@ -10,6 +10,7 @@ Stored programs are executable code: they live in the private folder of
 
 import contextlib
 import functools
+import gc
 import hashlib
 import importlib.metadata
 import inspect
@@ -29,6 +30,8 @@ from jax.experimental.serialize_executable import deserialize_and_load, serializ
 
 _FOLDER = "programs"
 _KEPT = 400  # names of stored programs; the ones used least recently go first
+_MAPS, _MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+_MAP_SHARE = 0.6  # of the memory maps that a process may have, in use before programs are dropped
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Program:
     stored: bool
 
 
-_PROGRAMS: dict[Hashable, Program] = {}
+_PROGRAMS: dict[Hashable, Program] = {}  # the one used last comes last
 _LOCK = threading.Lock()
 
 
@@ -75,13 +78,13 @@ def program(
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     key = (name, source, tree, shapes, tuple(devices), jax.config.values["jax_enable_x64"])
-    if found := _PROGRAMS.get(key):
-        return found, False
     # One at a time: two threads that want the same program must not both compile it.
     with _LOCK:
-        if found := _PROGRAMS.get(key):
+        if found := _PROGRAMS.pop(key, None):
+            _PROGRAMS[key] = found
             return found, False
         started = time.perf_counter()
+        _make_room()
         path = _path(name, source, tree, shapes, devices)
         stored = path and _load(path, tree, devices)
         if stored:
@@ -104,6 +107,22 @@ def program(
         made = Program(call, used, time.perf_counter() - started, bool(stored))
         _PROGRAMS[key] = made
         return made, True
+
+
+def _make_room() -> None:
+    """Drops the programs used least recently while the process is short of memory maps.
+
+    A program for a CPU holds some per kernel, thousands in all; Linux allows a process 65,530 by
+    default, and LLVM ends a process that asks for more.
+    """
+    try:
+        allowed = _MAP_SHARE * int(_MAX_MAPS.read_text())
+        count = lambda: _MAPS.read_bytes().count(b"\n")
+        while _PROGRAMS and count() > allowed:
+            del _PROGRAMS[next(iter(_PROGRAMS))]
+            gc.collect()
+    except OSError:  # not Linux
+        return
 
 
 def _twin(path: Path, lowered: Any, arguments: tuple, devices: Sequence) -> Path:
