@@ -303,7 +303,8 @@ def apply(
     given = features.neighbors_past.shape[-3]
     if given < config.neighbors:
         raise ValueError(
-            f"features hold {given} neighbours, the network predicts {config.neighbors}"
+            f"features.neighbors_past holds {given} neighbours, fewer than the "
+            f"{config.neighbors} that the network predicts; pad with zeros"
         )
     return bind(_build(config), params)(features, neighbors, Dropout(key))
 

@@ -13,6 +13,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 LAYER_NORM_EPSILON = 1e-5
@@ -58,7 +59,23 @@ class Drop:
 
 def uniform_param(rngs: nnx.Rngs, shape: tuple[int, ...], bound: float) -> nnx.Param:
     """Returns a variable drawn evenly from [-bound, bound]."""
-    return nnx.Param(jax.random.uniform(rngs.params(), shape, jnp.float32, -bound, bound))
+    return _drawn(rngs, shape, lambda generator: generator.uniform(-bound, bound, shape))
+
+
+def constant_param(value: float, *shape: int) -> nnx.Param:
+    """Returns a variable of equal values."""
+    return nnx.Param(np.full(shape, value, np.float32))
+
+
+def _drawn(
+    rngs: nnx.Rngs, shape: tuple[int, ...], draw: Callable[[np.random.Generator], np.ndarray]
+) -> nnx.Param:
+    """Draws on the host: hundreds of draws in one program take XLA half a minute to compile."""
+    key = rngs.params()
+    if isinstance(key, jax.core.Tracer):
+        return nnx.Param(np.zeros(shape, np.float32))  # only the shape is asked for
+    generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    return nnx.Param(draw(generator).astype(np.float32))
 
 
 class Linear(nnx.Module):
@@ -78,8 +95,8 @@ class LayerNorm(nnx.Module):
     """Normalises the last axis; the variance is taken in a second pass, as torch does."""
 
     def __init__(self, width: int):
-        self.weight = nnx.Param(jnp.ones(width, jnp.float32))
-        self.bias = nnx.Param(jnp.zeros(width, jnp.float32))
+        self.weight = constant_param(1, width)
+        self.bias = constant_param(0, width)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps `[..., width]` to the same shape."""
@@ -93,7 +110,9 @@ class Embedding(nnx.Module):
     """One row per index, drawn from N(0, 1)."""
 
     def __init__(self, rows: int, width: int, rngs: nnx.Rngs):
-        self.weight = nnx.Param(jax.random.normal(rngs.params(), (rows, width), jnp.float32))
+        self.weight = _drawn(
+            rngs, (rows, width), lambda generator: generator.normal(size=(rows, width))
+        )
 
     def __call__(self, index: jax.Array) -> jax.Array:
         """Maps integers `[...]` to `[..., width]`."""
@@ -135,9 +154,9 @@ class MultiheadAttention(nnx.Module):
         self._heads = heads
         xavier = math.sqrt(6 / (4 * width))
         self.in_proj_weight = uniform_param(rngs, (3 * width, width), xavier)
-        self.in_proj_bias = nnx.Param(jnp.zeros(3 * width, jnp.float32))
+        self.in_proj_bias = constant_param(0, 3 * width)
         self.out_proj = Linear(width, width, rngs)
-        self.out_proj.bias = nnx.Param(jnp.zeros(width, jnp.float32))
+        self.out_proj.bias = constant_param(0, width)
 
     def __call__(
         self,

@@ -13,14 +13,20 @@ Build = Callable[[nnx.Rngs], ModuleT]
 
 
 def init_params(build: Build[ModuleT], key: jax.Array) -> Params:
-    """Returns the variables of a new module.
+    """Returns the variables of a new module, drawn on the host.
 
     Args:
       build: makes the module.
       key: typed random key.
+
+    Raises:
+      ValueError: the key is traced.
     """
-    # One compiled program: drawing hundreds of arrays one by one takes seconds.
-    return jax.jit(lambda k: nnx.to_pure_dict(nnx.state(build(nnx.Rngs(params=k)))))(key)
+    if isinstance(key, jax.core.Tracer):
+        raise ValueError("the key of init is traced: call init outside jit and vmap")
+    with jax.ensure_compile_time_eval():
+        state = nnx.state(build(nnx.Rngs(params=key)))
+    return jax.device_put(nnx.to_pure_dict(state))
 
 
 def abstract_params(build: Build[ModuleT]) -> Params:

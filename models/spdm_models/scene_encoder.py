@@ -130,7 +130,7 @@ class PositionalEncoding(nnx.Module):
     """Adds a code of the point index, then dropout."""
 
     def __init__(self, points: int, width: int):
-        self.pe = Buffer(jnp.asarray(position_table(points, width)))
+        self.pe = Buffer(position_table(points, width))
 
     def __call__(self, x: jax.Array, dropout: Dropout) -> jax.Array:
         """Maps `[..., points, width]` to the same shape."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
@@ -87,14 +86,14 @@ def from_state_dict(
     extras = extras or Extras()
     wanted = flatten(template)
     problems: list[str] = []
-    kept: dict[str, jax.Array] = {}
+    kept: dict[str, np.ndarray] = {}
     for name, given in state.items():
         value = np.asarray(given)
         owner = _owner(name, extras)
         if name in wanted:
             problem = _problem(value, wanted[name].shape)
             if problem is None:
-                kept[name] = jnp.asarray(value, dtype)
+                kept[name] = value.astype(dtype)
         elif name in extras.constants:
             same = np.array_equal(value, extras.constants[name])
             problem = None if same else "differs from what this configuration gives"
@@ -114,7 +113,7 @@ def from_state_dict(
             f"{source} does not fit the model: {len(problems)} keys\n  {listed}{tail}\n"
             "Check the model's name and configuration against those of the training run."
         )
-    return unflatten(kept, template)
+    return jax.device_put(unflatten(kept, template))
 
 
 def to_state_dict(params: Params, extras: Extras | None = None) -> dict[str, np.ndarray]:
