@@ -118,7 +118,7 @@ def target_speeds(
 
 
 def speed_coefficients(
-    speed: jax.Array, acceleration: jax.Array, target: jax.Array, seconds: float
+    speed: jax.Array, acceleration: jax.Array, target: jax.Array, seconds: float | jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Cubic v(t) = c0 + c1 t + c2 t^2 + c3 t^3 that ends at the target with acceleration 0."""
     c2 = -2 * acceleration / seconds - 3 * speed / seconds**2 + 3 * target / seconds**2

@@ -78,12 +78,13 @@ def _targets(data, dtype, sample: slice) -> DTPPTargets:
 
 def _evaluate(params, config, features, branches, targets):
     encoding = dtpp.encode(params, config, features)
-    outputs = [
+    first, second = (
         dtpp.decode(params, config, encoding, features, given, steps)
         for given, (_, steps) in zip(branches, STAGES, strict=True)
-    ]
-    parts = loss(*outputs, *branches, targets)
-    return parts.total, (parts, encoding, outputs, metrics(outputs[1], branches[1], targets))
+    )
+    parts = loss(first, second, branches[0], branches[1], targets)
+    moved = metrics(second, branches[1], targets)
+    return parts.total, (parts, encoding, (first, second), moved)
 
 
 _forward = jax.jit(_evaluate, static_argnums=1)

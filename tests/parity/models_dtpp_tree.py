@@ -11,7 +11,8 @@ from spdm_jax.geometry import box_at
 from spdm_models import dtpp
 from spdm_models.dtpp import DTPPConfig
 from spdm_models.dtpp_paths import ReferencePaths, is_obstacle, reference_paths
-from spdm_models.dtpp_tree import TreeConfig, expand, plan_tree, speed_coefficients, target_speeds
+from spdm_models.dtpp_planner import DTPPPlannerConfig, plan
+from spdm_models.dtpp_tree import TreeConfig, expand, speed_coefficients, target_speeds
 from spdm_models.lattice import Course, Polyline, lattice_paths
 from spdm_models.scene_encoder import EncoderConfig, SceneFeatures
 
@@ -19,6 +20,7 @@ from .models_common import load_weights
 
 CONFIG = DTPPConfig(encoder=EncoderConfig(width=32))
 TREE = TreeConfig(reference_wrap=True)
+PLANNER = DTPPPlannerConfig(network=CONFIG, tree=TREE)
 LANES = (("A0", "B0"), ("A1", "B1"))
 VEHICLE, CONE = 0, 1
 NO_LIMIT = 13.0
@@ -105,9 +107,9 @@ def _paths(report, name, data, dtype) -> None:
     counts = jnp.asarray([len(lanes[i]) for i in order], jnp.int32)
     lines = Polyline(*(jnp.asarray(padded[..., i], dtype) for i in range(3)), count=counts)
     objects = data["objects"]
-    columns = [jnp.asarray(column, dtype) for column in objects.T]
-    boxes = box_at(*columns[1:4], 0.5 * columns[4], 0.5 * columns[5])
-    blocks = is_obstacle(columns[0] == VEHICLE, columns[0] == CONE, columns[6])
+    kind, x, y, heading, length, width, speed = (jnp.asarray(column, dtype) for column in objects.T)
+    boxes = box_at(x, y, heading, 0.5 * length, 0.5 * width)
+    blocks = is_obstacle(kind == VEHICLE, kind == CONE, speed)
     valid = jnp.ones(len(order), bool)
     ours = _reference_paths(lines, valid, ego, boxes, blocks, TREE.num_paths)
     # Costs are told apart by 1e-3 m at most; float32 sums of metres.
@@ -201,29 +203,18 @@ def _predictions(report, name, key, params, features, steps, data, dtype) -> Non
     report.close(name, f"{key}/scores", scores, data[f"{key}/scores"][0], tol)
 
 
-@jax.jit
-def _plan(params, features, paths, speed, acceleration, limit):
-    encoding = dtpp.encode(params, CONFIG, features)
-
-    def score(branches):
-        steps = branches.states.shape[1]
-        states = jnp.pad(branches.states, ((0, 0), (0, 80 - steps), (0, 0)))
-        output = dtpp.decode(
-            params, CONFIG, encoding, features, states, steps, branch_valid=branches.valid
-        )
-        return output.scoring.scores
-
-    return plan_tree(paths, speed, acceleration, limit, score, TREE)
+_plan = jax.jit(plan, static_argnames="config")
 
 
 def _whole_tree(report, name, params, features, courses, limit, data, dtype) -> None:
     """From the reference paths to the chosen trajectory."""
     paths = ReferencePaths(courses, jnp.ones(courses.x.shape[0], bool), jnp.zeros(()))
     speed, acceleration = (jnp.asarray(v, dtype) for v in data["ego_pose_v_a"][3:])
-    plan = _plan(params, features, paths, speed, acceleration, jnp.asarray(limit, dtype))
-    report.equal(name, "plan valid", bool(plan.valid), True)
+    given = params, features, paths, speed, acceleration, jnp.asarray(limit, dtype)
+    found = _plan(*given, config=PLANNER)
+    report.equal(name, "plan valid", bool(found.valid), True)
     for i, (stage, scores) in enumerate(
-        ((plan.first, plan.first_scores), (plan.second, plan.second_scores))
+        ((found.first, found.first_scores), (found.second, found.second_scores))
     ):
         reference = data[f"predict{i}/ego_trajs"][..., :6]
         ours = np.asarray(stage.states)[np.asarray(stage.valid)]
@@ -232,5 +223,5 @@ def _whole_tree(report, name, params, features, courses, limit, data, dtype) -> 
             _close_states(report, name, f"tree {i}", ours, reference)
             given = data[f"predict{i}/scores"][0]
             report.close(name, f"tree {i} scores", scores, given, TREE_SCORE_TOLERANCE)
-    ours = np.stack([plan.x, plan.y, plan.heading], -1)
+    ours = np.stack([found.x, found.y, found.heading], -1)
     _close_states(report, name, "best_traj", ours, data["best_traj"])
