@@ -6,6 +6,7 @@ Shapes leave out leading batch axes; every call takes any number of them.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from .layers import (
@@ -31,7 +32,9 @@ class PaddedEmbedding(Embedding):
 
     def __init__(self, rows: int, width: int, rngs: nnx.Rngs):
         super().__init__(rows, width, rngs)
-        self.weight[...] = self.weight[...].at[0].set(0)
+        drawn = np.array(self.weight[...])
+        drawn[0] = 0
+        self.weight = nnx.Param(drawn)
 
     def __call__(self, index: jax.Array) -> jax.Array:
         """Maps integers `[...]` to `[..., width]`."""
