@@ -463,6 +463,22 @@ def test_padding_changes_nothing(pack: Path, whole: Path, tmp_path: Path, monkey
 
 
 @pytest.mark.slow
+def test_scenarios_that_lack_room_are_driven_again(tmp_path: Path, monkeypatch):
+    ahead = [Thing(FRONT + way, -3.5, speed=10.0, id=f"lead-{way}") for way in (20.0, 40.0)]
+    (tmp_path / "pack").mkdir()
+    for token, things in (("one", ahead[:1]), ("two", ahead)):
+        raw = roads.road(token=token, things=things)
+        write_scenario(tmp_path / "pack" / f"{token}.npz", *build_scenario(raw))
+    drivers = ["--planner", "constant-velocity", "--traffic", "reactive"]
+    assert run(tmp_path / "pack", tmp_path / "usual", *drivers) == 0
+    monkeypatch.setattr("spdm_experiments.simulate_work.MAX_AGENTS", 1)
+    assert run(tmp_path / "pack", tmp_path / "again", *drivers) == 0
+    assert_frame_equal(rows(tmp_path / "again"), rows(tmp_path / "usual"), abs_tol=1e-5)
+    told = json.loads((tmp_path / "again" / "progress-all.json").read_text())
+    assert told["sessions"][0]["programs"] == 2
+
+
+@pytest.mark.slow
 def test_a_planner_drives_a_suite(tmp_path: Path):
     more = ["--planner", "pdm-closed", "--num-proposals", "3", "--limit", "1"]
     out = tmp_path / "run"

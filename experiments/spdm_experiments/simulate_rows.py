@@ -53,8 +53,8 @@ VALUES = {
 }
 """Columns that are null where a scenario failed; those of the other mode are null as well."""
 REASONS = {
-    "overflow": "more path points, red lights or agents than there is room for; use the Python API "
-    "with a larger PlannerConfig or AgentSizes",
+    "overflow": "more path points, red lights or agents than there is room for, also when driven "
+    "again with more of it; use the Python API with a larger PlannerConfig or AgentSizes",
     "planner": "the planner returned a number that is not finite after {time:.1f} s",
     "short": "the record ends before the last plan does, so that it cannot be compared; pack with "
     "8 s beyond the window, or use --mode closed",
