@@ -196,15 +196,19 @@ def test_float32_stays_float32():
     assert {v.dtype for v in jax.tree.leaves(ours)} == {np.dtype(np.float32), np.dtype(bool)}
 
 
+def drive(controls, speed: float):
+    zero = jnp.zeros(())
+    return bicycle(jnp.asarray(controls), zero, zero, zero, jnp.asarray(speed))
+
+
 def test_bicycle_clips_speed_after_the_whole_sum():
-    controls = jnp.asarray(np.array([[-5.0, 0.0]] * 2 + [[5.0, 0.0]] * 2))
-    motion = bicycle(controls, 0.0, 0.0, 0.0, 0.6)
+    motion = drive(np.array([[-5.0, 0.0]] * 2 + [[5.0, 0.0]] * 2), 0.6)
     np.testing.assert_allclose(motion.speed, [0.1, 0, 0.1, 0.6], atol=1e-12)
     np.testing.assert_allclose(motion.x, np.cumsum([0.01, 0, 0.01, 0.06]), atol=1e-12)
 
 
 def test_steering_is_clipped_and_its_gradient_passes_at_the_bound():
-    turn = lambda steering: bicycle(jnp.array([[0.0, steering]]), 0.0, 0.0, 0.0, 3.089).heading[0]
+    turn = lambda steering: drive(jnp.array([[0.0, steering]]), 3.089).heading[0]
     np.testing.assert_allclose([turn(0.6), turn(0.9)], [0.06, 0.06])
     np.testing.assert_allclose([jax.grad(turn)(0.6), jax.grad(turn)(0.9)], [0.1, 0])
 

@@ -35,7 +35,11 @@ def make_lines(counts=(POINTS, POINTS)) -> Polyline:
     """The ego's lane and the one left of it, along +x from x = 0."""
     x = np.broadcast_to(0.25 * np.arange(POINTS), (2, POINTS))
     y = np.broadcast_to(LANE_WIDTH * np.arange(2)[:, None], (2, POINTS))
-    return Polyline(x + 0.0, y + 0.0, np.zeros((2, POINTS)), np.array(counts, np.int32))
+    return make_polyline(x, y, np.zeros((2, POINTS)), counts)
+
+
+def make_polyline(x, y, heading, count) -> Polyline:
+    return Polyline(*map(jnp.asarray, (x, y, heading)), count=jnp.asarray(count, jnp.int32))
 
 
 def make_boundaries(right: float) -> Boundaries:
@@ -48,7 +52,7 @@ def make_boundaries(right: float) -> Boundaries:
 
 def boxes(*centers):
     x, y = (np.array(v, float) for v in zip(*centers, strict=True))
-    return box_at(x, y, np.zeros_like(x), np.full_like(x, 2.3), np.full_like(x, 1.0))
+    return box_at(*map(jnp.asarray, (x, y, 0 * x, 0 * x + 2.3, 0 * x + 1.0)))
 
 
 def price(obstacle=AWAY, vehicle=AWAY, right=-5.0, lines=None):
@@ -100,7 +104,9 @@ def test_objects_are_told_apart():
     vehicle = np.array([True, True, False, False, True])
     static = np.array([False, False, True, False, False])
     speed = np.array([0.0, 3.0, 0.0, 1.0, 0.0])
-    obstacle, moving = path_objects(objects, vehicle, static, speed, boxes((0.0, 0.0)))
+    obstacle, moving = path_objects(
+        objects, *map(jnp.asarray, (vehicle, static, speed)), boxes((0.0, 0.0))
+    )
     assert obstacle.tolist() == [True, False, True, False, False]
     assert moving.tolist() == [False, True, False, False, False]
 
@@ -116,11 +122,11 @@ def test_annotations_slow_down_for_turns_and_mark_red_connectors():
     x = np.concatenate([np.arange(0, 30, 2.5), 30 + 6 * np.sin(angle)])
     y = np.concatenate([np.zeros(12), 6 - 6 * np.cos(angle)])
     course = spline_course(jnp.asarray(x), jnp.asarray(y), jnp.asarray(len(x)))
-    red = Polyline(
+    red = make_polyline(
         np.stack([20 + 0.1 * np.arange(100)] * 3),
         np.stack([np.full(100, v) for v in (0.3, 0.3, 5.0)]),
         np.zeros((3, 100)),
-        np.array([100, 60, 0], np.int32),
+        (100, 60, 0),
     )
     ours = _annotate(course, jnp.asarray(True), jnp.asarray(40.0), red)
     assert float(ours.speed_limit[0]) == 15 and float(ours.speed_limit[-1]) == 3
@@ -154,8 +160,8 @@ def make_agents(x: float, y: float, present=True) -> tuple[np.ndarray, np.ndarra
     return modes, np.array([[0.0, 1.0]] * 2), now * present
 
 
-def cells(x, y=0.0, present=True, red=slice(0)) -> np.ndarray:
-    return np.asarray(_occupancy(*make_agents(x, y, present), make_reference(red=red)))
+def cells(x, y=0.0, present=True, red=slice(0)) -> jax.Array:
+    return _occupancy(*make_agents(x, y, present), make_reference(red=red))
 
 
 def test_agents_on_the_path_occupy_their_length_and_3_m_behind():
@@ -168,10 +174,10 @@ def test_agents_on_the_path_occupy_their_length_and_3_m_behind():
     assert np.flatnonzero(cells(30.0, present=False, red=slice(500, 511))[0]).tolist() == [50, 51]
 
 
-def plan_at(speed: float) -> np.ndarray:
+def plan_at(speed: float) -> jax.Array:
     plan = np.zeros((STEPS, 3))
     plan[:, 0] = 0.1 * speed * np.arange(1, STEPS + 1)
-    return plan
+    return jnp.asarray(plan)
 
 
 def test_refinement_brakes_for_occupied_cells_ahead():
@@ -192,7 +198,7 @@ def test_without_a_reference_path_the_plan_stays():
 
 
 def test_speeds_on_the_path_are_whole_rows():
-    start = plan_on_path(jnp.asarray(plan_at(7.3)), jnp.asarray(make_reference().path))
+    start = plan_on_path(plan_at(7.3), jnp.asarray(make_reference().path))
     assert set(np.round(np.asarray(start.speed), 9)) == {7.0, 8.0}
     assert int(start.row[-1]) == 584
 

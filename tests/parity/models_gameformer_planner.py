@@ -88,10 +88,10 @@ def check_planner(path: Path, report, dtype) -> None:
 def _curves(report, name, data, dtype) -> None:
     tol = GEOMETRY[report.precision]
     for i, row in enumerate(data["bezier/in"]):
-        start, end = (tuple(jnp.asarray(v, dtype) for v in part) for part in (row[:3], row[3:]))
+        x0, y0, heading0, x1, y1, heading1 = (jnp.asarray(v, dtype) for v in row)
         count = int(data["bezier/n_points"][i])
         share = jnp.linspace(0, 1, count, dtype=dtype)
-        ours = jnp.stack(bezier_points(start, end, share), axis=-1)
+        ours = jnp.stack(bezier_points((x0, y0, heading0), (x1, y1, heading1), share), axis=-1)
         report.close(name, f"bezier/path{i}", ours, data[f"bezier/path{i}"], tol)
     report.not_compared(name, "bezier/control*", "a step on the way to the paths")
     knots = jnp.asarray(data["spline/in_xy"], dtype)
@@ -138,8 +138,9 @@ def _ego_box(pose) -> Box:
     vehicle = VehicleParams()
     x, y, heading = pose
     ahead = vehicle.rear_axle_to_center
-    half = (jnp.asarray(0.5 * v, x.dtype) for v in (vehicle.length, vehicle.width))
-    return box_at(x + ahead * jnp.cos(heading), y + ahead * jnp.sin(heading), heading, *half)
+    x, y = x + ahead * jnp.cos(heading), y + ahead * jnp.sin(heading)
+    half = [jnp.asarray(0.5 * v, x.dtype) for v in (vehicle.length, vehicle.width)]
+    return box_at(x, y, heading, half[0], half[1])
 
 
 def _paths(report, name, data, dtype) -> None:
@@ -165,10 +166,9 @@ def _paths(report, name, data, dtype) -> None:
             report.equal(name, f"{array} length", len(xy), len(data[array]))
             if len(xy) == len(data[array]):
                 report.close(name, array, xy, data[array], tol)
-    columns = [jnp.asarray(column, dtype) for column in data["objects"].T]
-    boxes = box_at(*columns[1:4], 0.5 * columns[4], 0.5 * columns[5])
-    kinds = columns[0] == VEHICLE, columns[0] == CONE
-    obstacle, moving = path_objects(boxes, *kinds, columns[6], _ego_box(ego))
+    kind, x, y, heading, length, width, speed = (jnp.asarray(v, dtype) for v in data["objects"].T)
+    boxes = box_at(x, y, heading, 0.5 * length, 0.5 * width)
+    obstacle, moving = path_objects(boxes, kind == VEHICLE, kind == CONE, speed, _ego_box(ego))
     usable = jnp.ones(len(order), bool)
     costs = _costs(lines, usable, ego, boxes, obstacle, moving, boundaries)
     parts = data["lattice/cost_parts"]
@@ -341,8 +341,6 @@ CHECKS = {r"planner_seed\d+": check_planner, r"ar_tokens_seed\d+": check_tokens}
 
 def check_gameformer_planner(path: Path, report, dtype) -> bool:
     """Runs the check that the file's name asks for; False if it is none of these."""
-    if path.parent.name != "gameformer":
-        return False
     for pattern, check in CHECKS.items():
         if re.fullmatch(pattern, path.stem):
             check(path, report, dtype)

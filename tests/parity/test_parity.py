@@ -11,6 +11,11 @@ GOLDEN = ROOT.parent / "shared" / "golden"
 FEW = ("unit_comfort", "unit_path", "unit_lqr", "unit_driving_direction")
 FEW_SIMULATED = ("single_steps", "curve_tail", "yellow_then_red", "random_4")
 FEW_RUNS = ("random_5", "offroad_0p2", "sn_none_speed_limit")
+FEW_PLANNERS = (
+    "dipp/planner_f64_seed1",
+    "gameformer/planner_seed0",
+    "gameformer/ar_tokens_seed0",
+)
 
 
 def compare(folder: Path, precision: str) -> str:
@@ -61,6 +66,14 @@ def test_simulation(golden: Path, tmp_path: Path, precision: str):
         for path in cases.glob(f"*/{name}.*"):
             (tmp_path / path.name).symlink_to(path)
     (tmp_path / "maps").symlink_to(cases / "idm" / "maps")
+    assert ", 0 failed" in compare(tmp_path, precision)
+
+
+@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
+def test_planners_of_models(golden: Path, tmp_path: Path, precision: str):
+    for name in FEW_PLANNERS:
+        path = golden.with_name("models") / f"{name}.npz"
+        (tmp_path / path.name).symlink_to(path)
     assert ", 0 failed" in compare(tmp_path, precision)
 
 
