@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from spdm_jax.arrays import order_of, prefix_sum, rank_of
+from spdm_jax.arrays import order_of, prefix_sum
 from spdm_jax.config import DT, SplineParams
 from spdm_jax.geometry import Path, interpolate, make_path, project, unwrap_masked, wrap
 from spdm_jax.proposals.lanes import sequence_path
@@ -202,8 +202,7 @@ def route_lane_paths(
 
     The oncoming lane, where one is given, comes between the two: after lanes on which one drives
     the right way, and before the own lane, to which stage 1 leads back as well, so that on a road
-    with one lane per direction K = 1 already holds it. Its shortest merge distance comes first:
-    it is entered slowly, close to what blocks the own lane.
+    with one lane per direction K = 1 already holds it.
 
     Args:
       lanes: lane table.
@@ -241,8 +240,7 @@ def route_lane_paths(
     else:
         borrowed = branch == num_branches - 1
         group = jnp.where(borrowed, 1, jnp.where(found.own[branch], 2, 0))
-        turn = jnp.where(borrowed, rank_of(distance)[merge], merge)
-        rank = order_of(branch, found.key[branch], turn, group, ~usable)
+        rank = order_of(branch, found.key[branch], merge, group, ~usable)
     chosen = rank[:num_paths]
     if chosen.shape[0] < num_paths:
         chosen = jnp.pad(chosen, (0, num_paths - chosen.shape[0]), constant_values=rank[-1])
