@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from small_road import EGO_X, LANE_WIDTH, LIMIT, Thing, lane_end, observe, parked, road, scene_of
+from spdm_jax.simulation.loop import SimulationConfig, SimulationParams, simulate
 from spdm_jax.types import ObjectType
+from spdm_models import dtpp
 from spdm_models.dtpp import DTPPConfig
+from spdm_models.dtpp_driver import DTPPDriverConfig, dtpp_driver
 from spdm_models.dtpp_planner import (
     TRAINING_LIMIT,
     UNKNOWN_LIMIT,
@@ -19,6 +22,8 @@ from spdm_models.dtpp_planner import (
 )
 from spdm_models.dtpp_tree import TreeConfig
 from spdm_models.route_lines import RouteLineConfig, route_lines
+from spdm_models.scene_encoder import EncoderConfig
+from spdm_models.scene_features import FeatureConfig
 
 LINES = RouteLineConfig(num_lines=4, num_points=401, max_path_points=512)
 CONFIG = DTPPPlannerConfig(network=DTPPConfig(), tree=TreeConfig(num_branches=30), lines=LINES)
@@ -112,3 +117,35 @@ def test_training_trees_are_sorted_by_their_distance_to_the_expert():
     # Nobody drives backwards in these trees.
     away = tree_of(scene, -steady, CONFIG)
     assert not bool(away.useful)
+
+
+DRIVER = DTPPDriverConfig(
+    planner=DTPPPlannerConfig(
+        network=DTPPConfig(EncoderConfig(width=16, heads=2, layers=1)), lines=LINES
+    ),
+    features=FeatureConfig(lanes=4, crosswalks=1, route_lanes=2),
+)
+
+
+@jax.jit
+def drive(scene, params):
+    driver = dtpp_driver(params, DRIVER)
+    settings = SimulationConfig(num_samples=3, record_plans=True)
+    return simulate(scene, driver, SimulationParams(), settings)
+
+
+@pytest.mark.slow
+def test_an_untrained_network_drives_along_the_road():
+    params = dtpp.init(DRIVER.planner.network, jax.random.key(1))
+    run = drive(scene_of(road(things=[Thing(90.0, -LANE_WIDTH, speed=8.0)]), jnp.float32), params)
+    assert not bool(run.failed) and not bool(run.overflow)
+    plans = jax.tree.map(np.asarray, run.plans)
+    assert plans.x.shape == (3, 81)
+    np.testing.assert_allclose(plans.x[:, 0], run.history.ego.x[:3], atol=1e-5)
+    assert np.all(np.diff(plans.x, axis=1) > -1e-3)
+    assert np.all(np.abs(plans.y - plans.y[0, 0]) < 1.1 * LANE_WIDTH)
+    # Off the route there is no path, and the plan is to stand.
+    lost = drive(scene_of(road(ego_y=15.0), jnp.float32), params)
+    plans = jax.tree.map(np.asarray, lost.plans)
+    assert not bool(lost.failed)
+    np.testing.assert_allclose(plans.x, np.broadcast_to(plans.x[:, :1], (3, 81)), atol=1e-5)
