@@ -20,6 +20,7 @@ from spdm_jax.io.scenario_file import read_scenario
 from spdm_jax.synthetic import SyntheticReader
 
 VERBS = (
+    "convert",
     "demo",
     "doctor",
     "label",

@@ -13,6 +13,7 @@ import tyro
 
 from spdm_experiments import commands
 from spdm_experiments.options import (
+    Convert,
     Demo,
     Doctor,
     Label,
@@ -67,6 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(options: Options) -> bool:
     """Runs one verb; returns False if something in it failed."""
     match options:
+        case Convert():
+            return commands.convert(options)
         case Demo():
             return commands.demo(options)
         case Doctor():

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spdm_experiments.options import (
+    Convert,
     Demo,
     Doctor,
     Label,
@@ -24,6 +25,21 @@ from spdm_experiments.options import (
 
 if TYPE_CHECKING:
     from spdm_jax.io.pack import PackReport
+
+
+def convert(options: Convert) -> bool:
+    """Writes a model's weights as .safetensors."""
+    from spdm_models.weights import load_weights, save_weights
+
+    settings: dict[str, Any] = {}
+    if options.variable_cost:
+        if options.model != "dtpp":
+            raise ValueError(f"--variable-cost is a setting of dtpp, not of {options.model}")
+        settings["variable_cost"] = True
+    config, params = load_weights(options.source, options.model, options.prefix, **settings)
+    save_weights(options.destination, options.model, config, params)
+    print(f"{options.destination}: {config}")
+    return True
 
 
 def doctor(options: Doctor) -> bool:

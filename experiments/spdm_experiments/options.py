@@ -68,6 +68,26 @@ class Planner(Compute):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Convert(Common):
+    """Turn a torch checkpoint of a learned model into a .safetensors file. Needs no torch.
+
+    Every array is checked by name, shape and value. The file keeps torch's names and knows the
+    model's sizes.
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="SRC")]
+    """A .pth, .pt, .ckpt, .npz or .safetensors file."""
+    destination: Annotated[Positional[Path], arg(metavar="DST")]
+    """The .safetensors file to write."""
+    model: Literal["gameformer", "dtpp", "dipp"]
+    """What the weights belong to."""
+    prefix: str = ""
+    """The part of SRC that holds the weights, if it holds more (model, state_dict, ...)."""
+    variable_cost: bool = False
+    """DTPP was trained with cost weights that depend on the scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Demo(Compute):
     """Plan the built-in scenes with SPDM (60) and PDM-Closed (15) and compare. Needs no data."""
 
@@ -400,4 +420,6 @@ class Vocab(Compute):
     """Take the first so many scenarios, in the order of their file names."""
 
 
-Options = Demo | Doctor | Label | Pack | Plan | Report | Score | Show | Simulate | Sweep | Vocab
+Options = (
+    Convert | Demo | Doctor | Label | Pack | Plan | Report | Score | Show | Simulate | Sweep | Vocab
+)

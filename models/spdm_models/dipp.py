@@ -4,6 +4,7 @@ Source: DIPP `Predictor` (public code); submodules carry its names, so that its 
 Shapes below leave out leading batch axes; every function takes any number of them.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -261,6 +262,22 @@ def init(config: DIPPConfig, key: jax.Array) -> Params:
 def abstract_params(config: DIPPConfig) -> Params:
     """Returns shapes and dtypes of the weights, without making any."""
     return module_params.abstract_params(lambda rngs: Predictor(config, rngs))
+
+
+def config_of(state: Mapping[str, np.ndarray]) -> DIPPConfig:
+    """Returns the sizes of the network whose torch state dict this is.
+
+    Raises:
+      ValueError: a name that tells a size is missing.
+    """
+    try:
+        width = len(state["plan.control.1.bias"])
+        horizon = len(state["plan.control.3.bias"]) // 2
+    except KeyError as error:
+        raise ValueError(f"{error} is missing: this is no state dict of DIPP") from None
+    mode = "agent_map.map_attention.attention.{}.in_proj_bias".format
+    modes = sum(mode(i) in state for i in range(len(state)))
+    return DIPPConfig(width=width, modes=modes, horizon=horizon)
 
 
 def apply(
