@@ -1,1 +1,1 @@
-"""Flax models on the evaluator's data structures; none is ported yet."""
+"""GameFormer, DTPP and DIPP in Flax, on the data structures of the evaluator."""
