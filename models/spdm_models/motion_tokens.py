@@ -83,18 +83,18 @@ def compose(pose: jax.Array, step: jax.Array) -> jax.Array:
 
 def corner_distance(a: jax.Array, b: jax.Array, box: TokenBox) -> jax.Array:
     """Mean distance of the corners of the box at two poses, m; poses `[..., 3]` broadcast."""
-    return sum(_corner_gaps(jnp, a, b, box)) / 4
+    return _mean_corner_gap(jnp, a, b, box)
 
 
-def _corner_gaps(numerics, a, b, box: TokenBox) -> list:
+def _mean_corner_gap(numerics, a, b, box: TokenBox):
     cos = numerics.cos(a[..., 2]) - numerics.cos(b[..., 2])
     sin = numerics.sin(a[..., 2]) - numerics.sin(b[..., 2])
     dx, dy = a[..., 0] - b[..., 0], a[..., 1] - b[..., 1]
-    gaps = []
+    total = 0.0
     for front, left in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
         x, y = 0.5 * front * box.length, 0.5 * left * box.width
-        gaps.append(numerics.hypot(dx + x * cos - y * sin, dy + x * sin + y * cos))
-    return gaps
+        total = total + numerics.hypot(dx + x * cos - y * sin, dy + x * sin + y * cos)
+    return total / 4
 
 
 def k_disks(
@@ -129,8 +129,7 @@ def k_disks(
     left, kept = order.astype(np.int64), []
     while left.size and (size is None or len(kept) < size):
         kept.append(left[0])
-        gaps = sum(_corner_gaps(np, steps[left], steps[left[0]], box)) / 4
-        left = left[gaps > radius]
+        left = left[_mean_corner_gap(np, steps[left], steps[left[0]], box) > radius]
     return np.array(kept, np.int64)
 
 

@@ -25,7 +25,7 @@ WEIGHTS = (0.2, 0.2, 0.1, 0.3, 0.1, 1.0, 10.0, 10.0, 10.0)
 
 
 def make_problem(
-    speed=LIMIT, y=0.0, agent=(200.0, 0.0), valid=True, info=None, dtype=np.float64
+    speed=LIMIT, y=0.0, agent=(200.0, 0.0), valid=True, info=None, dtype: type = np.float64
 ) -> DIPPProblem:
     """A straight road along +x with one standing agent."""
     path = np.zeros((ROWS, 3))

@@ -104,9 +104,8 @@ def test_objects_are_told_apart():
     vehicle = np.array([True, True, False, False, True])
     static = np.array([False, False, True, False, False])
     speed = np.array([0.0, 3.0, 0.0, 1.0, 0.0])
-    obstacle, moving = path_objects(
-        objects, *map(jnp.asarray, (vehicle, static, speed)), boxes((0.0, 0.0))
-    )
+    vehicle, static, speed = (jnp.asarray(v) for v in (vehicle, static, speed))
+    obstacle, moving = path_objects(objects, vehicle, static, speed, boxes((0.0, 0.0)))
     assert obstacle.tolist() == [True, False, True, False, False]
     assert moving.tolist() == [False, True, False, False, False]
 
