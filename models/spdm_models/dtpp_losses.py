@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from spdm_jax.types import Array
 from spdm_models.dtpp import StageOutput
 from spdm_models.optimizers import WEIGHT_DECAY, clip_by_norm
 from spdm_models.state_dict import trainable
@@ -30,8 +31,8 @@ class DTPPTargets(struct.PyTreeNode, kw_only=True):
       neighbors_future: `[..., A, T, 3]` x, y, heading; zero where there is no track.
     """
 
-    ego_future: jax.Array
-    neighbors_future: jax.Array
+    ego_future: Array
+    neighbors_future: Array
 
 
 class StageLoss(struct.PyTreeNode, kw_only=True):

@@ -101,10 +101,9 @@ def bezier_points(
     (x0, y0, h0), (x3, y3, h3) = start, end
     third = jnp.hypot(x3 - x0, y3 - y0) / 3
     rest = 1 - share
-    weights = (rest**3, 3 * rest**2 * share, 3 * rest * share**2, share**3)
 
-    def curve(*control):
-        return sum(w * c for w, c in zip(weights, control, strict=True))
+    def curve(p0, p1, p2, p3):
+        return rest**3 * p0 + 3 * share * rest * (rest * p1 + share * p2) + share**3 * p3
 
     return (
         curve(x0, x0 + third * jnp.cos(h0), x3 - third * jnp.cos(h3), x3),

@@ -85,7 +85,11 @@ def on_batch(function, params):
 @pytest.fixture(scope="module")
 def run(params):
     """Total loss, its parts, and the outputs of both stages."""
-    flat = lambda *args: (lambda total, aux: (total, *aux))(*evaluate(*args))
+
+    def flat(*args):
+        total, aux = evaluate(*args)
+        return total, *aux
+
     return on_batch(flat, params)
 
 
