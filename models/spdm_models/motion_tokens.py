@@ -7,7 +7,7 @@ nucleus sampling after Holtzman et al. 2020. No public code is followed.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ def corner_distance(a: jax.Array, b: jax.Array, box: TokenBox) -> jax.Array:
     return _mean_corner_gap(jnp, a, b, box)
 
 
-def _mean_corner_gap(numerics, a, b, box: TokenBox):
+def _mean_corner_gap(numerics, a, b, box: TokenBox) -> Any:
     cos = numerics.cos(a[..., 2]) - numerics.cos(b[..., 2])
     sin = numerics.sin(a[..., 2]) - numerics.sin(b[..., 2])
     dx, dy = a[..., 0] - b[..., 0], a[..., 1] - b[..., 1]
