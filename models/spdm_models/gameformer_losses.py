@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from spdm_jax.types import Array
+
 from .gameformer import GameFormerConfig, GameFormerOutput, LevelOutput, apply
 from .params import Params
 from .scene_encoder import SceneFeatures
@@ -25,8 +27,8 @@ class Targets(struct.PyTreeNode, kw_only=True):
       neighbors: `[B, N, T, 3]` of the predicted neighbours, zero where there is no sample.
     """
 
-    ego: jax.Array
-    neighbors: jax.Array
+    ego: Array
+    neighbors: Array
 
 
 class Losses(struct.PyTreeNode, kw_only=True):

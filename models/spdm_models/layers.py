@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.core import Tracer
 
 LAYER_NORM_EPSILON = 1e-5
 DROPOUT_RATE = 0.1
@@ -72,7 +73,7 @@ def _drawn(
 ) -> nnx.Param:
     """Draws on the host: hundreds of draws in one program take XLA half a minute to compile."""
     key = rngs.params()
-    if isinstance(key, jax.core.Tracer):
+    if isinstance(key, Tracer):
         return nnx.Param(np.zeros(shape, np.float32))  # only the shape is asked for
     generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     return nnx.Param(draw(generator).astype(np.float32))

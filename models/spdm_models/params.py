@@ -5,6 +5,7 @@ from typing import Any, TypeVar
 
 import jax
 from flax import nnx
+from jax.core import Tracer
 
 # Nested dict of arrays; the keys along a path, joined by dots, are a torch state dict's name.
 Params = dict[Any, Any]
@@ -22,7 +23,7 @@ def init_params(build: Build[ModuleT], key: jax.Array) -> Params:
     Raises:
       ValueError: the key is traced.
     """
-    if isinstance(key, jax.core.Tracer):
+    if isinstance(key, Tracer):
         raise ValueError("the key of init is traced: call init outside jit and vmap")
     with jax.ensure_compile_time_eval():
         state = nnx.state(build(nnx.Rngs(params=key)))

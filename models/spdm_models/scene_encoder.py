@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx, struct
 
+from spdm_jax.types import Array
+
 from .layers import (
     LSTM,
     Buffer,
@@ -69,11 +71,11 @@ class SceneFeatures(struct.PyTreeNode, kw_only=True):
       route_lanes: `[R, 50, 3]` x, y, heading.
     """
 
-    ego_past: jax.Array
-    neighbors_past: jax.Array
-    lanes: jax.Array
-    crosswalks: jax.Array
-    route_lanes: jax.Array
+    ego_past: Array
+    neighbors_past: Array
+    lanes: Array
+    crosswalks: Array
+    route_lanes: Array
 
     def validate(self) -> None:
         """Checks that the shapes fit together.

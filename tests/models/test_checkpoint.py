@@ -146,7 +146,7 @@ def test_written_files_come_back(tmp_path: Path):
         for name, value in state.items():
             np.testing.assert_array_equal(read[name], value)
             assert read[name].dtype == np.asarray(value).dtype
-    np.savez(tmp_path / "w.npz", **state)
+    np.savez(tmp_path / "w.npz", allow_pickle=False, **state)
     assert read_checkpoint(tmp_path / "w.npz").keys() == state.keys()
     assert read_metadata(tmp_path / "w.npz") == {}
     with pytest.raises(ValueError, match=r"\.safetensors"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,11 +16,11 @@ from spdm_models.dtpp import DTPPConfig
 from spdm_models.gameformer import GameFormerConfig
 from spdm_models.scene_encoder import EncoderConfig
 from spdm_models.state_dict import flatten
-from spdm_models.weights import load_weights, save_weights
+from spdm_models.weights import ModelName, load_weights, save_weights
 
 KEY = jax.random.key(0)
 ENCODER = EncoderConfig(width=16, layers=1)
-MODELS = {
+MODELS: dict[ModelName, tuple[Any, Any]] = {
     "gameformer": (gameformer, GameFormerConfig(ENCODER, levels=2, modes=3, neighbors=4, steps=8)),
     "dtpp": (dtpp, DTPPConfig(ENCODER, seconds=3)),
     "dipp": (dipp, DIPPConfig(width=16, modes=2, horizon=7)),
@@ -32,17 +33,18 @@ def same(a, b) -> bool:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_weights_come_back(name, tmp_path: Path):
+def test_weights_come_back(name: ModelName, tmp_path: Path):
     module, config = MODELS[name]
     params, path = module.init(config, KEY), tmp_path / "w.safetensors"
     save_weights(path, name, config, params)
     found, read = load_weights(path, name)
     assert found == config and same(read, params)
     # Without what the file says of itself, the sizes come from the arrays.
-    np.savez(tmp_path / "w.npz", **read_checkpoint(path))
+    np.savez(tmp_path / "w.npz", allow_pickle=False, **read_checkpoint(path))
     found, read = load_weights(tmp_path / "w.npz", name)
     assert found == config and same(read, params)
-    np.savez(tmp_path / "more.npz", **{f"model.{k}": v for k, v in read_checkpoint(path).items()})
+    more = {f"model.{name}": value for name, value in read_checkpoint(path).items()}
+    np.savez(tmp_path / "more.npz", allow_pickle=False, **more)
     arguments = [str(tmp_path / "more.npz"), str(tmp_path / "new.safetensors"), "--model", name]
     assert cli.main(["convert", *arguments, "--prefix", "model"]) == 0
     found, read = load_weights(tmp_path / "new.safetensors", name)
@@ -71,7 +73,7 @@ def test_convert_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtur
     save_weights(path, "dipp", config, module.init(config, KEY))
     state = read_checkpoint(path)
     state["plan.control.1.bias"][2] = np.nan
-    np.savez(tmp_path / "bad.npz", **state)
+    np.savez(tmp_path / "bad.npz", allow_pickle=False, **state)
     target = tmp_path / "new.safetensors"
     for source, extra, message in (
         (tmp_path / "bad.npz", [], "plan.control.1.bias holds 1 values that are not finite"),
