@@ -4,6 +4,7 @@ import io
 import json
 import pickle
 import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -49,7 +50,10 @@ def read_checkpoint(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     if read is None:
         known = ", ".join(_READERS)
         raise ValueError(f"{path}: ending {path.suffix!r} is not one of {known}; rename the file")
-    found = _flat(read(path))
+    try:
+        found = _flat(read(path))
+    except RecursionError:
+        raise ValueError(f"{path}: its dicts contain themselves; no plain weights") from None
     if prefix:
         below = f"{prefix}."
         kept = {k.removeprefix(below): v for k, v in found.items() if k.startswith(below)}
@@ -123,12 +127,24 @@ def _read_torch(path: Path) -> Any:
         with zipfile.ZipFile(path) as archive:
             inner = [name for name in archive.namelist() if name.endswith("/data.pkl")]
             if len(inner) != 1:
-                raise ValueError(f"{path}: {len(inner)} files data.pkl inside, expected one")
-            folder = inner[0].removesuffix("data.pkl")
-            return _TorchUnpickler(archive, folder, archive.read(inner[0])).load()
-    except (pickle.UnpicklingError, zipfile.BadZipFile, EOFError, KeyError, IndexError) as error:
+                raise pickle.UnpicklingError(f"{len(inner)} files data.pkl inside, expected one")
+            return _TorchUnpickler(archive, inner[0].removesuffix("data.pkl")).load()
+    except _PICKLE_ERRORS as error:
         raise ValueError(f"{path}: no readable torch checkpoint ({error})") from error
 
+
+# What damaged or hostile bytes make the standard library raise.
+_PICKLE_ERRORS = (
+    pickle.UnpicklingError,
+    zipfile.BadZipFile,
+    zlib.error,
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
 
 _READERS: dict[str, Callable[[Path], Any]] = {
     ".pth": _read_torch,
@@ -146,25 +162,25 @@ class _TorchUnpickler(pickle.Unpickler):
     that nothing of the file is run.
     """
 
-    def __init__(self, archive: zipfile.ZipFile, folder: str, pickled: bytes):
-        super().__init__(io.BytesIO(pickled))
+    def __init__(self, archive: zipfile.ZipFile, folder: str):
+        super().__init__(io.BytesIO(archive.read(f"{folder}data.pkl")))
         self._archive, self._folder = archive, folder
         self._storages: dict[str, np.ndarray] = {}
         order = f"{folder}byteorder"
         self._swapped = order in archive.namelist() and archive.read(order).strip() == b"big"
+        # A pickle may set attributes of what it is given: these functions are this reader's own.
+        self._known = {
+            ("collections", "OrderedDict"): OrderedDict,
+            ("torch", "Size"): tuple,
+            ("torch._utils", "_rebuild_tensor_v2"): lambda *given: _tensor(*given),
+            ("torch._utils", "_rebuild_parameter"): lambda data, *_: data,
+            **{("torch", name): name for name in STORAGES},
+        }
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
         """Resolves the few names that tensors need."""
-        known = {
-            ("collections", "OrderedDict"): OrderedDict,
-            ("torch", "Size"): tuple,
-            ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-            ("torch._utils", "_rebuild_parameter"): _parameter,
-        }
-        if module_name == "torch" and global_name in STORAGES:
-            return STORAGES[global_name]
         try:
-            return known[module_name, global_name]
+            return self._known[module_name, global_name]
         except KeyError:
             raise pickle.UnpicklingError(
                 f"it names {module_name}.{global_name}, which is no part of plain weights; save "
@@ -173,17 +189,15 @@ class _TorchUnpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any, /) -> np.ndarray:
         """Returns the elements of a storage."""
-        kind, dtype, key, _, count = pid
-        if kind != "storage" or not isinstance(dtype, np.dtype):
+        kind, storage, key, _, count = pid
+        if kind != "storage" or storage not in STORAGES:
             raise pickle.UnpicklingError(f"unknown persistent object {kind!r}")
         if key not in self._storages:
             stored = self._archive.read(f"{self._folder}data/{key}")
-            elements = np.frombuffer(stored, dtype)
-            if self._swapped:
-                elements = elements.byteswap()
+            elements = np.frombuffer(stored, STORAGES[storage])
             if len(elements) < count:
                 raise pickle.UnpicklingError(f"storage {key} is cut short")
-            self._storages[key] = elements
+            self._storages[key] = elements.byteswap() if self._swapped else elements
         return self._storages[key]
 
 
@@ -198,11 +212,6 @@ def _tensor(
         raise pickle.UnpicklingError(f"a tensor of shape {size} reaches beyond its storage")
     steps = tuple(step * storage.itemsize for step in stride)
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False)
-
-
-def _parameter(data: np.ndarray, *_: Any) -> np.ndarray:
-    """Stands in for torch's `_rebuild_parameter`."""
-    return data
 
 
 def _flat(found: Any, prefix: str = "") -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from spdm_models import checkpoint
 from spdm_models.checkpoint import read_checkpoint, read_metadata, write_checkpoint
 from spdm_models.state_dict import Extras, flatten, from_state_dict, to_state_dict
 
@@ -99,6 +100,20 @@ def test_nothing_of_a_file_is_run(tmp_path: Path, call: bytes):
     assert not mark.exists()
 
 
+def test_a_file_cannot_change_the_reader(tmp_path: Path):
+    """BUILD sets attributes of what a name resolves to: it must not outlive the file."""
+    rebuild = b"ctorch._utils\n_rebuild_tensor_v2\n"
+    build = rebuild + b"(N(" + text("__doc__") + text("changed") + b"dtb"
+    path = torch_file(tmp_path / "w.pth", pickled({"x": build}), s0=VALUES)
+    with pytest.raises(ValueError, match=r"x is .*no array"):
+        read_checkpoint(path)
+    assert checkpoint._tensor.__doc__ != "changed"
+    # A dict that contains itself: memoised, then stored under its own key.
+    cyclic = b"\x80\x02" + DICT + b"p0\n(" + text("x") + b"g0\nu."
+    with pytest.raises(ValueError, match="contain themselves"):
+        read_checkpoint(torch_file(tmp_path / "w.pth", cyclic))
+
+
 @pytest.mark.parametrize(
     "opcodes, message",
     [
@@ -108,6 +123,9 @@ def test_nothing_of_a_file_is_run(tmp_path: Path, call: bytes):
         (tensor("FloatStorage", "9", 6, 0, (2,), (1,)), "data/9"),
         (tensor("QUInt8Storage", "0", 6, 0, (2,), (1,)), "QUInt8Storage"),
         (b"I1", "no readable torch checkpoint"),
+        (tensor("FloatStorage", "0", 6, 0, (-1,), (1,)), "no readable torch checkpoint"),
+        (b"(" + text("storage") + b"tQ", "no readable torch checkpoint"),
+        (b"ctorch\nFloatStorage\n(I1\ntR", "no readable torch checkpoint"),
     ],
 )
 def test_damaged_torch_files(tmp_path: Path, opcodes: bytes, message: str):
