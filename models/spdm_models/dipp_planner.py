@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -163,7 +162,6 @@ def bicycle(
     speed: jax.Array,
     *,
     max_steering: float = 0.6,
-    turn: Literal["linear", "tangent"] = "linear",
 ) -> Motion:
     """Drives a kinematic bicycle from a state.
 
@@ -174,16 +172,15 @@ def bicycle(
       heading: scalar, rad.
       speed: scalar, m/s.
       max_steering: limit of the steering angle, rad.
-      turn: whether the yaw rate is v delta / L or v tan(delta) / L.
 
-    Source: DIPP `bicycle_model`; the speed is clipped at 0 after the whole sum, positions use the
-    updated speed and heading.
+    Source: DIPP `bicycle_model` of its training script: the yaw rate is v delta / L, the speed is
+    clipped at 0 after the whole sum, positions use the updated speed and heading. (Its test script
+    drives with tan(delta).)
     """
     acceleration = clamp(controls[:, 0], -MAX_ACCELERATION, MAX_ACCELERATION)
     steering = clamp(controls[:, 1], -max_steering, max_steering)
     speed = clamp(speed + prefix_sum(acceleration * DT), 0)
-    slope = jnp.tan(steering) if turn == "tangent" else steering
-    heading = jnp.fmod(heading + prefix_sum(speed * slope / WHEELBASE * DT), 2 * jnp.pi)
+    heading = jnp.fmod(heading + prefix_sum(speed * steering / WHEELBASE * DT), 2 * jnp.pi)
     return Motion(
         x=x + prefix_sum(speed * jnp.cos(heading) * DT),
         y=y + prefix_sum(speed * jnp.sin(heading) * DT),

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +55,16 @@ class GaussNewtonSolution(struct.PyTreeNode, kw_only=True):
     converged: Array
 
 
+class _Search(NamedTuple):
+    """Iterate, its objective (of the iterate before, until judged), the best so far."""
+
+    values: jax.Array
+    error: jax.Array
+    best: jax.Array
+    best_error: jax.Array
+    converged: jax.Array
+
+
 def gauss_newton_step(
     residual: Callable[[jax.Array], jax.Array], values: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -99,30 +109,37 @@ def gauss_newton(
     Source: theseus 0.2.3 `GaussNewton` with dense solvers (objective, tolerances, best iterate).
     """
 
-    def objective(values):
-        return 0.5 * jnp.sum(residual(values) ** 2)
+    def judge(state: _Search, error: jax.Array) -> _Search:
+        change = jnp.abs(state.error - error)
+        small = change < config.absolute_tolerance
+        small = small | (change < config.relative_tolerance * state.error)
+        better = error < state.best_error
+        return _Search(
+            values=state.values,
+            error=error,
+            best=jnp.where(better, state.values, state.best),
+            best_error=jnp.where(better, error, state.best_error),
+            converged=small,
+        )
 
-    def iterate(carry, _):
-        values, error, best, best_error, converged = carry
-        step, _ = gauss_newton_step(residual, values)
-        values = jnp.where(converged, values, values + config.step_size * step)
-        now = objective(values)
-        change = jnp.abs(error - now)
-        small = (change < config.absolute_tolerance) | (change < config.relative_tolerance * error)
-        better = now < best_error
-        best = jnp.where(better, values, best)
-        best_error = jnp.where(better, now, best_error)
-        return (values, now, best, best_error, small), now
+    def iterate(state: _Search, _):
+        # The linearisation tells the objective too: what the last step led to is judged here.
+        step, error = gauss_newton_step(residual, state.values)
+        state = judge(state, error)
+        moved = state.values + config.step_size * step
+        values = jnp.where(state.converged, state.values, moved)
+        return state._replace(values=values), error
 
-    first = objective(start)
-    carry = (start, first, start, first, jnp.asarray(False))
-    carry, errors = jax.lax.scan(iterate, carry, length=config.iterations)
-    values, error, best, best_error, converged = carry
+    unknown = jnp.full((), jnp.inf, start.dtype)
+    state = _Search(start, unknown, start, unknown, jnp.asarray(False))
+    state, errors = jax.lax.scan(iterate, state, length=config.iterations)
+    last = 0.5 * jnp.sum(residual(state.values) ** 2)
+    values, error, best, best_error, converged = judge(state, last)
     if config.result == "best":
         values, error = best, best_error
     return GaussNewtonSolution(
         values=values,
         objective=error,
-        objectives=jnp.concatenate([first[None], errors]),
+        objectives=jnp.append(errors, last),
         converged=converged,
     )

@@ -10,7 +10,11 @@ PATH_STEP = 0.1
 def nearest_point(xy: jax.Array, path: jax.Array) -> jax.Array:
     """Returns `[...]` int32 indices of the samples `[P, >= 2]` nearest to `[..., 2]`."""
     offset = jax.lax.stop_gradient(xy)[..., None, :] - jax.lax.stop_gradient(path[:, :2])
-    return jnp.argmin(jnp.sum(offset**2, axis=-1), axis=-1)
+    square = jnp.sum(offset**2, axis=-1)
+    # The first smallest entry, several times faster on a CPU than `argmin`.
+    index = jnp.arange(path.shape[0], dtype=jnp.int32)
+    smallest = jnp.min(square, axis=-1, keepdims=True)
+    return jnp.min(jnp.where(square <= smallest, index, path.shape[0] - 1), axis=-1)
 
 
 def signed_distance(xy: jax.Array, path: jax.Array, index: jax.Array) -> jax.Array:
