@@ -43,7 +43,7 @@ def test_the_program_used_least_recently_goes_first(
     allowed.write_text("20\n")
     monkeypatch.setattr(programs, "_MAPS", maps)
     monkeypatch.setattr(programs, "_MAX_MAPS", allowed)
-    made(2), made(3), made(2)
+    assert [made(factor) for factor in (2, 3, 2)] == [True, True, False]
     monkeypatch.setattr(programs, "_MAP_SHARE", 0.1)
 
     # Nothing that is dropped changes these numbers, so all go.

@@ -201,7 +201,7 @@ def drive_borrowing(
     until = DT * begin + time
     allowed = may_borrow(around, first, until, speeds, params) | ~paths.borrowed[:, None]
     valid = jnp.where(slowed[:, None], paths.valid[:, None] & fits & allowed, valid)
-    return *(choose(a, b) for a, b in zip(pose, (x, y, heading), strict=True)), valid
+    return choose(pose[0], x), choose(pose[1], y), choose(pose[2], heading), valid
 
 
 def may_borrow(

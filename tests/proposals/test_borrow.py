@@ -27,9 +27,9 @@ from spdm_jax.proposals.oncoming import OncomingLane, oncoming_lane
 from spdm_jax.proposals.spline import RouteLanePaths, drive, route_lane_paths
 from spdm_jax.types import ObjectType, Scenario
 
-FEW = {"speed_fractions": (0.5, 1.0), "lateral_offsets": (0.0,), "config": roads.CONFIG}
-OFF = spdm(10, **FEW)
-ON = spdm(10, **FEW | {"config": dataclasses.replace(roads.CONFIG, borrow_oncoming=True)})
+FEW = partial(spdm, 10, speed_fractions=(0.5, 1.0), lateral_offsets=(0.0,))
+OFF = FEW(config=roads.CONFIG)
+ON = FEW(config=dataclasses.replace(roads.CONFIG, borrow_oncoming=True))
 PARAMS = PlannerParams()
 END = 460.0
 SIZE = roads.CONFIG.max_path_points
