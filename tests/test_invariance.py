@@ -83,7 +83,7 @@ def test_rotation_and_translation(planner: str, angle: float, shift: tuple[float
     np.testing.assert_allclose(np.cos(there[:, 2] - here[:, 2] - angle), 1, atol=1e-9)
 
 
-@pytest.mark.parametrize("planner", ["PDM", "SPDM"])
+@pytest.mark.parametrize("planner", ["PDM", pytest.param("SPDM", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_order_of_tracks_lanes_and_blocks(planner: str, seed: int):
     raw = busy()

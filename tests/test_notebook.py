@@ -30,6 +30,7 @@ def test_notebook_is_stored_without_outputs(path: Path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.slow
 def test_notebook_runs(path: Path, tmp_path: Path):
     """Its code runs in a fresh process; no kernel is needed for that."""
     code = ["".join(cell["source"]) for cell in cells(path) if cell["cell_type"] == "code"]

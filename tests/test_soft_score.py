@@ -88,6 +88,7 @@ def hard(scenes: ScenarioSet, poses: jax.Array) -> Any:
     return score(scenes, np.asarray(poses), precision="f64")
 
 
+@pytest.mark.slow
 def test_every_term_converges_to_the_score(evaluate: Any, poses: jax.Array, hard: Any):
     converges([evaluate(poses, temperature=t)[0] for t in LADDER], hard)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import ml_dtypes
+import jax.numpy as jnp
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
@@ -19,7 +19,7 @@ STORAGES = {
     "DoubleStorage": np.dtype(np.float64),
     "FloatStorage": np.dtype(np.float32),
     "HalfStorage": np.dtype(np.float16),
-    "BFloat16Storage": np.dtype(ml_dtypes.bfloat16),
+    "BFloat16Storage": np.dtype(jnp.bfloat16),
     "LongStorage": np.dtype(np.int64),
     "IntStorage": np.dtype(np.int32),
     "ShortStorage": np.dtype(np.int16),
@@ -228,5 +228,5 @@ def _described(value: Any) -> str:
 
 
 def _widened(value: np.ndarray) -> np.ndarray:
-    narrow = value.dtype in (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
+    narrow = value.dtype in (np.dtype(np.float16), np.dtype(jnp.bfloat16))
     return value.astype(np.float32) if narrow else value

@@ -162,6 +162,7 @@ def extras(kind: ObstacleKind | None, scenario_type: str, *obstacles) -> Interpl
     )
 
 
+@pytest.mark.slow
 def test_whole_run():
     """The ego stays in its lane at 8 m/s, the expert has moved left at once and drives 10 m/s."""
     scene_map = straight_map()

@@ -3,7 +3,7 @@
 import zipfile
 from pathlib import Path
 
-import ml_dtypes
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -56,7 +56,7 @@ def test_torchs_layout(tmp_path: Path):
         "half": tensor("BFloat16Storage", "2", 2, 0, (2,), (1,)),
         "empty": tensor("FloatStorage", "0", 6, 0, (0, 3), (3, 1)),
     }
-    half = np.array([0.5, 3], ml_dtypes.bfloat16)
+    half = np.array([0.5, 3], jnp.bfloat16)
     storages = {"s0": VALUES, "s1": np.array([7], np.int64), "s2": half}
     path = torch_file(tmp_path / "w.pth", pickled(items), **storages)
     read = read_checkpoint(path)

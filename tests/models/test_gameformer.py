@@ -125,6 +125,7 @@ def emptied(features: SceneFeatures, *names: str) -> SceneFeatures:
     return features.replace(**{name: 0 * getattr(features, name) for name in names})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "missing",
     [
@@ -144,6 +145,7 @@ def test_empty_scenes_are_finite(params: Params, missing: tuple[str, ...]):
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 def test_replaced_predictions(params: Params):
     own, _ = outputs(params, scene(), scene())
     positions = FUTURES.neighbors[0, ..., :2]
@@ -157,6 +159,7 @@ def test_replaced_predictions(params: Params):
     assert np.abs(np.asarray(own.plan - given.plan)).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_dropout_needs_a_key():
     config = dataclasses.replace(CONFIG, levels=0)
     weights = init(config, KEY)
@@ -253,6 +256,7 @@ def test_shapes_are_checked(params: Params, changes: dict, message: str):
         apply(params, CONFIG, scene().replace(**changes))
 
 
+@pytest.mark.slow
 def test_stored_reference(shared: Path):
     folder = shared / "golden" / "models" / "gameformer"
     state = read_checkpoint(folder / "small_L0m6_seed0_params.npz")

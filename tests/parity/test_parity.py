@@ -36,14 +36,15 @@ def golden() -> Path:
     return GOLDEN / "pdm"
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("precision", [pytest.param("f64", marks=pytest.mark.slow), "f32"])
 def test_units(golden: Path, tmp_path: Path, precision: str):
     for name in FEW:
         (tmp_path / f"{name}.npz").symlink_to(golden / f"{name}.npz")
     assert ", 0 failed" in compare(tmp_path, precision)
 
 
-@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_a_scene(golden: Path, tmp_path: Path, precision: str):
     scene = sorted(path.name for path in golden.glob("scorer_*.npz"))[0].removeprefix("scorer_")
     for kind in ("scene", "scorer"):
@@ -59,7 +60,8 @@ def test_closed_loop_metrics(golden: Path, tmp_path: Path, precision: str):
     assert ", 0 failed" in compare(tmp_path, precision)
 
 
-@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_simulation(golden: Path, tmp_path: Path, precision: str):
     cases = golden.with_name("nuplan_sim")
     for name in FEW_SIMULATED:
@@ -69,7 +71,8 @@ def test_simulation(golden: Path, tmp_path: Path, precision: str):
     assert ", 0 failed" in compare(tmp_path, precision)
 
 
-@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_planners_of_models(golden: Path, tmp_path: Path, precision: str):
     for name in FEW_PLANNERS:
         path = golden.with_name("models") / f"{name}.npz"

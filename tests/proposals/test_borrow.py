@@ -311,6 +311,7 @@ def test_only_with_the_switch_a_blocked_lane_is_passed():
     assert held[:, 1].max() < 1.0 and held[-1, 0] + roads.FRONT < end
 
 
+@pytest.mark.slow
 def test_without_an_oncoming_lane_the_switch_changes_nothing():
     raw = roads.road(things=[roads.parked(25.0)])
     one, other = roads.plan(raw, OFF), roads.plan(raw, ON)

@@ -92,6 +92,7 @@ def test_agents_see_the_ego():
     assert np.all(gap > 0.2) and gap[-1] < 4.0
 
 
+@pytest.mark.slow
 def test_who_drives_and_who_vanishes():
     things = [
         Thing(60.0, 0.3, speed=5.0),  # is put onto its baseline

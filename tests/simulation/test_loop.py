@@ -115,6 +115,7 @@ def test_single_precision_stays_single():
     np.testing.assert_allclose(np.diff(history.ego.x), 1.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_idm_follows_and_stops_behind_the_leader():
     stops = [Thing(roads.EGO_X + 40.0, -3.5), Thing(roads.EGO_X + 20.0, 0.0)]
     raw = roads.road(things=stops, speed=8.0)
