@@ -371,17 +371,20 @@ def padded_bytes(sizes: Mapping[str, int]) -> int:
 
 
 def group_by_shape(
-    sizes: Sequence[Mapping[str, int]], padding: PaddingConfig | None = None
+    sizes: Sequence[Mapping[str, int]],
+    padding: PaddingConfig | None = None,
+    waste: float = WASTE,
 ) -> list[ShapeGroup]:
     """Puts scenarios of similar size into few groups of one padding each.
 
     One common padding would make every scenario as large as the largest of each axis; a padding
     for each would compile anew for each. Scenarios are taken by size, and a group ends where it
-    would cost more than `WASTE` times what its scenarios need alone.
+    would cost more than `waste` times what its scenarios need alone.
 
     Args:
       sizes: length of every free axis of each scenario, see `padding.sizes_of`.
       padding: bucket sizes.
+      waste: at least 1; more of it gives fewer groups.
 
     Returns:
       At most `MAX_GROUPS` groups, smallest scenarios first; rows in ascending order.
@@ -407,7 +410,6 @@ def group_by_shape(
             groups.append((own[i], [i]))
         return groups
 
-    waste = WASTE
     while len(groups := split(waste)) > MAX_GROUPS:
         waste *= 2
     return [

@@ -244,6 +244,8 @@ def test_a_large_scene_does_not_blow_up_the_small_ones(scenes: ScenarioSet):
     large = {**small[0], "grid_cells": 8_000_000, "grid_rows": 400_000, "grid_edges": 900_000}
     groups = group_by_shape([*small, large])
     assert [group.rows for group in groups] == [[0, 1, 2], [3]]
+    (together,) = group_by_shape([*small, large], waste=1e6)
+    assert together.rows == [0, 1, 2, 3]
 
 
 def test_prefetch_keeps_the_order_and_works_ahead():

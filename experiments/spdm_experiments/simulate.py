@@ -27,6 +27,10 @@ from spdm_jax.batching import BatchConfig, group_by_shape
 CPU_CHUNK = 8
 """Scenarios of a chunk on a CPU: a drive takes seconds, and a chunk is what a kill can cost."""
 
+WASTE = 4.0
+"""How much larger than need be a scenario may become to share a program, which takes half a minute
+to compile for each point."""
+
 
 def run_simulate(options: Simulate) -> bool:
     """Computes what a run still lacks; returns False if a scenario of the shard failed.
@@ -174,7 +178,7 @@ def _shapes(
 ) -> Iterator[tuple[Group, ScriptRoom | None, list[Entry]]]:
     """Yields the scenarios of one shape and length, scripted or not, which share a program."""
     kind_of = lambda entry: (entry.num_iterations, entry.token in extras)
-    for shape in group_by_shape([entry.sizes for entry in entries]):
+    for shape in group_by_shape([entry.sizes for entry in entries], waste=WASTE):
         mine = [entries[row] for row in shape.rows]
         for count, scripted in sorted({kind_of(entry) for entry in mine}):
             members = [entry for entry in mine if kind_of(entry) == (count, scripted)]
