@@ -239,6 +239,12 @@ def _quantiles(means: np.ndarray, known: np.ndarray) -> np.ndarray:
     return ends
 
 
+def known_means(values: np.ndarray) -> list[float]:
+    """Returns the mean of each column of `[N, K]`; NaN is no value, and the mean of none is NaN."""
+    columns = (column[np.isfinite(column)] for column in values.T)
+    return [float(column.mean()) if len(column) else np.nan for column in columns]
+
+
 def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
     """Returns one summary per grid point; scenarios that failed are counted only."""
     names = run.terms.columns()
@@ -247,8 +253,7 @@ def summarise(run: Run, seed: int = 0) -> list[PointSummary]:
         good = run.usable(point)
         values = good.select(polars.col(names).cast(polars.Float64)).to_numpy()
         ends = [(low, high) for low, high in bootstrap(values, seed).T.tolist()]
-        columns = (column[np.isfinite(column)] for column in values.T)
-        means = [float(column.mean()) if len(column) else np.nan for column in columns]
+        means = known_means(values)
         found.append(
             PointSummary(
                 point=point,

@@ -11,7 +11,7 @@ from rich.table import Table
 from spdm_experiments.grid_run import MAX_CHUNK, GridRun, Workers, check_chunk, group_of, workers_of
 from spdm_experiments.inventory import Entry, Shard
 from spdm_experiments.options import Simulate
-from spdm_experiments.report_data import bootstrap
+from spdm_experiments.report_data import bootstrap, known_means
 from spdm_experiments.report_grid import distinguishing, label
 from spdm_experiments.sequence import go_on
 from spdm_experiments.simulate_points import Point, make_points
@@ -132,8 +132,7 @@ class SimulateRun(GridRun):
             good = mine.filter(polars.col("status") == "ok")
             values = good.select(polars.col(score, *metrics).cast(polars.Float64)).to_numpy()
             low, high = bootstrap(values[:, :1], self._seed)[:, 0]
-            means = [column[np.isfinite(column)] for column in values.T]
-            means = [column.mean() if len(column) else np.nan for column in means]
+            means = known_means(values)
             about = self.layout.point(number)
             table.add_row(
                 *(_plain(about[name]) for name in names),

@@ -1,8 +1,11 @@
 """What the checks of the learned models share: weights, relative tolerances, gradients."""
 
 import json
+import re
 import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -137,3 +140,12 @@ def close_parameters(report, file: str, weights: dict, data, rate: float) -> Non
 def arrays(data, prefix: str, names, dtype) -> dict[str, jax.Array]:
     """Returns some of a golden's arrays on the device."""
     return {name: jnp.asarray(data[prefix + name], dtype) for name in names}
+
+
+def check_named(checks: Mapping[str, Callable[..., None]], path: Path, report: Any, dtype) -> bool:
+    """Runs the check whose pattern is the file's whole name; returns whether there is one."""
+    for pattern, check in checks.items():
+        if match := re.fullmatch(pattern, path.stem):
+            check(match, path, report, dtype)
+            return True
+    return False

@@ -26,6 +26,7 @@ from .models_common import (
     GRADIENT_TOLERANCE,
     LOSS_TOLERANCE,
     arrays,
+    check_named,
     check_recipe,
     close_gradients,
     close_parameters,
@@ -82,7 +83,7 @@ def _exact(report) -> float | None:
     return EXACT_TOLERANCE if report.precision == "f64" else None
 
 
-def _small(path: Path, report, dtype) -> None:
+def _small(match: re.Match, path: Path, report, dtype) -> None:
     """Encoders, outputs, loss and gradients of a batch; one planner step per sample."""
     weights = path.with_name(f"{path.stem}_params.npz")
     if not weights.is_file():
@@ -180,11 +181,8 @@ def _lanes(report, name, params, features, data) -> None:
         close_relative(report, name, key, value, data[key], tol)
 
 
-def _planner_gradients(path: Path, report, dtype) -> None:
+def _planner_gradients(match: re.Match, path: Path, report, dtype) -> None:
     """Loss and gradients through the two-step solve in float64, one sample."""
-    match = re.fullmatch(r"planner_grad_f64_seed(\d+)_sample(\d+)", path.stem)
-    if match is None:
-        raise ValueError(f"{path.name}: expected planner_grad_f64_seed<s>_sample<i>.npz")
     if report.precision == "f32":
         report.not_compared(path.name, "all", "float64 arrays; small_seed* has the float32 ones")
         return
@@ -214,9 +212,9 @@ def _planner_gradients(path: Path, report, dtype) -> None:
     close_gradients(report, name, "grad/", "gradnorm/", gradients, data, EXACT_SOLVE_TOLERANCE)
 
 
-def _full(path: Path, report, dtype) -> None:
+def _full(match: re.Match, path: Path, report, dtype) -> None:
     """The full-size network with weights from the recipe, on sample 0 of the small one."""
-    seed = path.stem.removeprefix("full_formula_seed")
+    seed = match[1]
     inputs = path.with_name(f"small_seed{seed}.npz")
     if not inputs.is_file():
         report.not_compared(path.name, "all", f"{inputs.name} is not beside it")
@@ -240,9 +238,9 @@ def _train_step(params, state, features, truth):
     return optax.apply_updates(params, updates), state, loss, optax.tree.norm(gradients)
 
 
-def _train(path: Path, report, dtype) -> None:
+def _train(match: re.Match, path: Path, report, dtype) -> None:
     """Five optimiser steps on the batch of the small network."""
-    seed = path.stem.removeprefix("train5_mfma_seed")
+    seed = match[1]
     inputs, weights = (path.with_name(f"small_seed{seed}{end}.npz") for end in ("", "_params"))
     if not (inputs.is_file() and weights.is_file()):
         report.not_compared(path.name, "all", f"{inputs.name} or its weights are not beside it")
@@ -267,9 +265,9 @@ def _train(path: Path, report, dtype) -> None:
 CHECKS = {
     r"small_seed\d+": _small,
     r"planner_f64_seed\d+": check_solves,
-    r"planner_grad_f64_seed\d+_sample\d+": _planner_gradients,
-    r"full_formula_seed\d+": _full,
-    r"train5_mfma_seed\d+": _train,
+    r"planner_grad_f64_seed(\d+)_sample(\d+)": _planner_gradients,
+    r"full_formula_seed(\d+)": _full,
+    r"train5_mfma_seed(\d+)": _train,
 }
 
 
@@ -277,10 +275,6 @@ def check_dipp(path: Path, report, dtype) -> bool:
     """Runs the check that the file's name asks for; False if it is no golden of DIPP."""
     if re.fullmatch(r"small_seed\d+_params", path.stem):
         return True  # read with the file that it belongs to
-    for pattern, check in CHECKS.items():
-        if re.fullmatch(pattern, path.stem):
-            if check is _full and "out/plans" not in np.load(path).files:
-                return False  # DTPP's file of the same name
-            check(path, report, dtype)
-            return True
-    return False
+    if path.stem.startswith("full_formula") and "out/plans" not in np.load(path).files:
+        return False  # DTPP's file of the same name
+    return check_named(CHECKS, path, report, dtype)

@@ -1,5 +1,6 @@
 """`models/dipp` goldens of the planner: residuals, single solves."""
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -103,7 +104,7 @@ _solve = jax.jit(solve, static_argnums=2)
 _drive = jax.jit(plan_trajectories)
 
 
-def check_solves(path: Path, report, dtype) -> None:
+def check_solves(match: re.Match, path: Path, report, dtype) -> None:
     """Solves from given controls, weights and predictions, stored in float64."""
     data, name = np.load(path), path.name
     exact = report.precision == "f64"

@@ -19,6 +19,7 @@ from .models_common import (
     EXACT_TOLERANCE,
     GRADIENT_TOLERANCE,
     LOSS_TOLERANCE,
+    check_named,
     check_recipe,
     close_gradients,
     close_parameters,
@@ -106,7 +107,7 @@ def _score_given(params, config, encoding, features, branches, steps, futures, n
     return output.scoring.scores
 
 
-def _small(path: Path, report, dtype) -> None:
+def _small(match: re.Match, path: Path, report, dtype) -> None:
     """Both samples alone, and together as the reference masks them."""
     weights = path.with_name(f"{path.stem}_params.npz")
     if not weights.is_file():
@@ -258,7 +259,7 @@ def _exact(report, name, prefix, sample, aux, data) -> None:
         close_relative(report, name, array, part.total, data[array], EXACT_TOLERANCE)
 
 
-def _full(path: Path, report, dtype) -> None:
+def _full(match: re.Match, path: Path, report, dtype) -> None:
     """The full-size network with weights from the recipe."""
     config = DTPPConfig()
     template = dtpp.abstract(config)
@@ -298,11 +299,8 @@ def _update(params, state, gradients):
     return optax.apply_updates(params, updates), state, norms
 
 
-def _train(path: Path, report, dtype) -> None:
+def _train(match: re.Match, path: Path, report, dtype) -> None:
     """Five optimiser steps on one sample of the small network."""
-    match = re.fullmatch(r"train5_(\w+cost)_b1_(\d+)_seed(\d+)", path.stem)
-    if match is None:
-        raise ValueError(f"{path.name}: expected train5_<cost>_b1_<i>_seed<s>.npz")
     kind, index, seed = match.groups()
     inputs, weights = (
         path.with_name(f"small_{kind}_seed{seed}{end}.npz") for end in ("", "_params")
@@ -332,7 +330,7 @@ def _train(path: Path, report, dtype) -> None:
 CHECKS = {
     r"small_(constant|variable)cost_seed\d+": _small,
     r"full_formula_seed\d+": _full,
-    r"train5_(constant|variable)cost_b1_\d+_seed\d+": _train,
+    r"train5_((?:constant|variable)cost)_b1_(\d+)_seed(\d+)": _train,
     r"tree_seed\d+": check_tree,
 }
 
@@ -343,8 +341,4 @@ def check_dtpp(path: Path, report, dtype) -> bool:
         return False
     if path.stem.endswith("_params"):
         return True  # read with the file that it belongs to
-    for pattern, check in CHECKS.items():
-        if re.fullmatch(pattern, path.stem):
-            check(path, report, dtype)
-            return True
-    return False
+    return check_named(CHECKS, path, report, dtype)

@@ -1,5 +1,6 @@
 """`models/dtpp/tree_*` goldens: paths, expansions, scores and choice of DTPP's tree planner."""
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def _course(rows: np.ndarray, dtype) -> Course:
     return Course(x, y, heading, curvature, count)
 
 
-def check_tree(path: Path, report, dtype) -> None:
+def check_tree(match: re.Match, path: Path, report, dtype) -> None:
     """Stage by stage from the reference's own inputs, then the whole tree."""
     data, name = np.load(path), path.name
     rows = data["speed_poly/in_v0_a0_vf_tf"]

@@ -21,6 +21,7 @@ from .models_common import (
     EXACT_TOLERANCE,
     GRADIENT_TOLERANCE,
     LOSS_TOLERANCE,
+    check_named,
     check_recipe,
     close_gradients,
     close_parameters,
@@ -249,9 +250,4 @@ def check_gameformer(path: Path, report, dtype) -> bool:
         return False
     if re.fullmatch(r"small_L\d+m\d+_seed\d+_params", path.stem):
         return True  # read with the file that it belongs to
-    for pattern, check in CHECKS.items():
-        match = re.fullmatch(pattern, path.stem)
-        if match:
-            check(match, path, report, dtype)
-            return True
-    return False
+    return check_named(CHECKS, path, report, dtype)

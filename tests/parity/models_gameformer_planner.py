@@ -41,6 +41,8 @@ from spdm_models.motion_tokens import (
 )
 from spdm_models.path_frame import nearest_point, signed_distance
 
+from .models_common import check_named
+
 LANES = ("0", "1")
 """Left and right lane of the synthetic road; each continues from block A to block B."""
 HALF_LANE = 1.75
@@ -68,7 +70,7 @@ _refine = jax.jit(refine)
 _residuals = jax.jit(refinement_residuals)
 
 
-def check_planner(path: Path, report, dtype) -> None:
+def check_planner(match: re.Match, path: Path, report, dtype) -> None:
     """Stage by stage, each from the reference's own inputs."""
     data, name = np.load(path), path.name
     _curves(report, name, data, dtype)
@@ -277,7 +279,7 @@ def _refinement(report, name, mode, reference, cells, data, dtype) -> None:
     report.close(name, f"{key}plan", ours.poses, data[f"{key}plan"], POSE_APART)
 
 
-def check_tokens(path: Path, report, dtype) -> None:
+def check_tokens(match: re.Match, path: Path, report, dtype) -> None:
     """Vocabulary, closed-loop tokens, nucleus and draws."""
     data, name = np.load(path), path.name
     demos = jnp.asarray(data["demo_trajs"], dtype)
@@ -341,8 +343,4 @@ CHECKS = {r"planner_seed\d+": check_planner, r"ar_tokens_seed\d+": check_tokens}
 
 def check_gameformer_planner(path: Path, report, dtype) -> bool:
     """Runs the check that the file's name asks for; False if it is none of these."""
-    for pattern, check in CHECKS.items():
-        if re.fullmatch(pattern, path.stem):
-            check(path, report, dtype)
-            return True
-    return False
+    return check_named(CHECKS, path, report, dtype)
