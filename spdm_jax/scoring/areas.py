@@ -16,11 +16,13 @@ class AreaMasks(NamedTuple):
       drivable: polygons of this step's drivable map (lanes and car parks near the ego).
       on_route: those that belong to the route.
       intersection: intersection areas.
+      lanes: lanes, where they are told apart by other bits than the drivable map; None takes its.
     """
 
     drivable: jax.Array
     on_route: jax.Array
     intersection: jax.Array
+    lanes: jax.Array | None = None
 
 
 class EgoAreas(NamedTuple):
