@@ -1,0 +1,87 @@
+"""A set of NAVSIM frames on the host, with what is known of each in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from spdm_jax.navsim.types import NavsimScene
+from spdm_jax.results import Failure
+from spdm_jax.scoring.profile import Profile
+
+FIRST = ("navsim1",)
+SECOND = ("navsim2", "navsim2_unfiltered")
+
+
+@dataclass(frozen=True)
+class NavsimInfo:
+    """What a frame says in words; stays on the host.
+
+    Attributes:
+      token: identifier, unique within a set.
+      log_name: source log, "" where the source does not tell.
+      source: "NAVSIM v1" or "NAVSIM v2" for an export, else the reader of the scenario.
+      profiles: names of the profiles that the frame has everything for.
+    """
+
+    token: str
+    log_name: str
+    source: str
+    profiles: tuple[str, ...]
+
+
+@dataclass
+class NavsimSet:
+    """Frames ready to be scored.
+
+    Attributes:
+      frames: NumPy leaves, float64; where the frame has a past, `previous` is a plan of zeros made
+        one frame earlier.
+      infos: one per frame.
+      failures: frames that could not be used.
+    """
+
+    frames: list[NavsimScene]
+    infos: list[NavsimInfo]
+    failures: list[Failure] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.infos)
+
+    def __repr__(self) -> str:
+        sources = ", ".join(sorted({info.source for info in self.infos}))
+        failed = f"; {len(self.failures)} failed, see .failures" if self.failures else ""
+        return f"NavsimSet({len(self)} frames, {sources}{failed})"
+
+    @property
+    def tokens(self) -> list[str]:
+        """Of the frames, in their order."""
+        return [info.token for info in self.infos]
+
+    def select(self, rows: Sequence[int]) -> NavsimSet:
+        """Returns some of the frames, in the order of `rows`, without the failures."""
+        return NavsimSet([self.frames[i] for i in rows], [self.infos[i] for i in rows])
+
+    def require(self, profile: Profile) -> None:
+        """Refuses a profile that a frame lacks something for.
+
+        Raises:
+          ValueError: names the frame, its source and what to do.
+        """
+        for info in self.infos:
+            if profile.name not in info.profiles:
+                raise ValueError(f"frame {info.token}: {_advice(info, profile)}")
+
+
+def _advice(info: NavsimInfo, profile: Profile) -> str:
+    able = " and ".join(info.profiles)
+    if info.source.startswith("NAVSIM"):
+        version = "v1.1" if profile.name in FIRST else "v2.2"
+        return (
+            f"exported with {info.source}, whose metric cache serves {able}, not {profile.name}; "
+            f"export the metric cache of NAVSIM {version}"
+        )
+    return (
+        f"has less than 1.5 s of recorded past, which {profile.name} needs; it serves {able}. "
+        "Take scenarios with more history"
+    )
