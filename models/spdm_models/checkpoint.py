@@ -71,13 +71,21 @@ def read_checkpoint(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """Returns what `write_checkpoint` was given beside the arrays; empty for other files."""
+    """Returns what `write_checkpoint` was given beside the arrays; empty for other files.
+
+    Raises:
+      ValueError: the file has no readable header.
+    """
     if path.suffix != ".safetensors":
         return {}
     with path.open("rb") as file:
         size = int.from_bytes(file.read(8), "little")
-        header = json.loads(file.read(size))
-    return json.loads(header.get("__metadata__", {}).get(METADATA_KEY, "{}"))
+        # A file of another kind may ask for any amount of memory here.
+        text = file.read(min(size, path.stat().st_size))
+    try:
+        return json.loads(json.loads(text).get("__metadata__", {}).get(METADATA_KEY, "{}"))
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"{path}: damaged, or no .safetensors file ({error})") from None
 
 
 def write_checkpoint(
@@ -96,7 +104,7 @@ def write_checkpoint(
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: weights are written as .safetensors; give the file that ending")
     part = path.with_name(f".{path.name}.part")
-    arrays = {name: np.ascontiguousarray(value) for name, value in state.items()}
+    arrays = {name: np.asarray(value, order="C") for name, value in state.items()}
     save_file(arrays, part, {METADATA_KEY: json.dumps(dict(metadata or {}))})
     part.replace(path)
 

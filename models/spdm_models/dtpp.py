@@ -212,7 +212,7 @@ class Decoder(nnx.Module):
         ego = encoding.tokens[..., 0, :]
         if futures is None:
             futures = self.predict(encoding, neighbors, branches, steps, dropout)
-        else:
+        elif futures.ndim == branches.ndim:
             shape = (*branches.shape[:-2], *futures.shape[-3:])
             futures = jnp.broadcast_to(futures[..., None, :, :, :], shape)
         scoring = self.scorer(
@@ -336,7 +336,8 @@ def decode(
       steps: real steps of the stage's branches (30, 80).
       dropout_key: typed random key for training; None switches dropout off.
       branch_valid: `[N]` bool; None takes branches that are all zero for padding.
-      futures: `[A, 80, 3]` replaces the predictions of every branch.
+      futures: `[A, 80, 3]` replaces the predictions of every branch, `[N, A, T, 3]` those of each
+        (T at least `steps`).
       neighbor_valid: `[A]` bool which neighbours the scores look at; None takes those that are
         there now.
 

@@ -5,24 +5,17 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 
-from spdm_jax.config import DT
-from spdm_jax.geometry import wrap
+from spdm_jax.agents.forecast import React
 from spdm_jax.planner import StepInput
-from spdm_jax.simulation.controller import Plan
 from spdm_jax.simulation.drivers import Driven, Driver
-from spdm_jax.types import EgoState, Scenario
+from spdm_jax.types import Scenario
 
 from .dtpp_planner import DTPPPlannerConfig, plan, scene_paths
-from .dtpp_tree import TreePlan
 from .params import Params
-from .scene_features import (
-    FeatureConfig,
-    History,
-    next_history,
-    pick_neighbors,
-    recorded_history,
-    scene_features,
-)
+from .plan_frame import plan_in_scene
+from .predictions import Prediction, futures_of
+from .scene_features import FeatureConfig, History, recorded_history
+from .sight import look
 
 MAP_RADIUS = 80.0
 """How far DTPP sees the map, m."""
@@ -35,50 +28,57 @@ class DTPPDriverConfig:
     Attributes:
       planner: network and tree.
       features: what the network sees.
+      prediction: what the scores take for the neighbours' futures, in both stages. Literal zeros
+        for "none" put every neighbour at the ego's start.
     """
 
     planner: DTPPPlannerConfig = field(default_factory=DTPPPlannerConfig)
     features: FeatureConfig = field(default_factory=lambda: FeatureConfig(radius=MAP_RADIUS))
+    prediction: Prediction = "learned"
 
 
 def dtpp_driver(params: Params, config: DTPPDriverConfig) -> Driver:
     """DTPP; the state is what was seen in the last 2 s, so it must be asked at every step.
 
     Where the tree finds no branch of 8 s, the plan is to stand where the ego is, as in the
-    reference.
+    reference. Perfect predictions in reactive traffic are how the agents would react to each
+    branch.
 
     Args:
       params: weights of the network; make the driver inside `jit`, so that they are no constants
         of the program.
       config: static settings.
     """
+    count = config.planner.network.neighbors
+
+    tree = config.planner.tree
+    steps = tree.first_steps + tree.second_steps
 
     def init(scene: Scenario) -> History:
         return recorded_history(scene, -1)
 
-    def step(scene: Scenario, given: StepInput, time: jax.Array, state: History) -> Driven:
-        ego, seen = given.ego, given.observation
-        history = next_history(state, ego, seen)
-        neighbors = pick_neighbors(history, config.features)
-        features = scene_features(
-            scene.map, scene.route, seen.lights, history, neighbors, config.features
+    def step(
+        scene: Scenario,
+        given: StepInput,
+        time: jax.Array,
+        state: History,
+        react: React | None = None,
+    ) -> Driven:
+        ego = given.ego
+        sight = look(scene, given, state, config.features)
+        found = scene_paths(scene.map, scene.route, ego, given.observation, config.planner)
+        beside = futures_of(config.prediction, scene, given, sight.neighbors, count, steps, react)
+        chosen = plan(
+            params,
+            sight.features,
+            found.paths,
+            ego.vx,
+            ego.ax,
+            found.limit,
+            config.planner,
+            futures=beside,
         )
-        found = scene_paths(scene.map, scene.route, ego, seen, config.planner)
-        tree = plan(params, features, found.paths, ego.vx, ego.ax, found.limit, config.planner)
-        return Driven(_in_scene(tree, ego, time), history, found.overflow)
+        poses = jnp.stack([chosen.x, chosen.y, chosen.heading], axis=-1)
+        return Driven(plan_in_scene(poses, ego, time), sight.history, found.overflow)
 
-    return Driver("DTPP", init, step)
-
-
-def _in_scene(tree: TreePlan, ego: EgoState, time: jax.Array) -> Plan:
-    """The chosen branch in the scene's frame, the current pose first."""
-    from_now = lambda values: jnp.concatenate([jnp.zeros_like(values[:1]), values])
-    x, y, heading = from_now(tree.x), from_now(tree.y), from_now(tree.heading)
-    cos, sin = jnp.cos(ego.heading), jnp.sin(ego.heading)
-    return Plan(
-        x=ego.x + cos * x - sin * y,
-        y=ego.y + sin * x + cos * y,
-        heading=wrap(ego.heading + heading),
-        time=jnp.arange(x.shape[0], dtype=x.dtype) * DT,
-        start=time,
-    )
+    return Driver("DTPP", init, step, step if config.prediction == "perfect" else None)

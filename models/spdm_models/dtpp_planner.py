@@ -19,6 +19,7 @@ from .dtpp import STEPS_PER_TOKEN, DTPPConfig
 from .dtpp_paths import ReferencePaths, is_obstacle, reference_paths
 from .dtpp_tree import Branches, TreeConfig, TreePlan, expand, first_stage, plan_tree
 from .params import Params
+from .predictions import Futures
 from .route_lines import RouteLineConfig, first_speed_limit, route_lines
 from .scene_encoder import SceneFeatures
 
@@ -134,6 +135,7 @@ def plan(
     limit: jax.Array,
     config: DTPPPlannerConfig,
     key: jax.Array | None = None,
+    futures: Futures | None = None,
 ) -> TreePlan:
     """Searches the tree with the network's scores; the scene is encoded once.
 
@@ -146,6 +148,8 @@ def plan(
       limit: `[]` speed limit, m/s.
       config: static settings.
       key: typed random key, see `dtpp_tree.second_stage`.
+      futures: gives what takes the place of the predictions under the branches of a stage; None
+        keeps the network's own.
     """
     network = config.network
     encoding = dtpp.encode(params, network, features)
@@ -159,6 +163,7 @@ def plan(
             pad_branches(branches.states, network),
             branches.states.shape[1],
             branch_valid=branches.valid,
+            futures=None if futures is None else futures(branches.states[..., :3]),
         )
         return output.scoring.scores
 

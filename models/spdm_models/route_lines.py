@@ -50,12 +50,16 @@ class RouteLines(struct.PyTreeNode, kw_only=True):
       line: `[C, M]` points in the scenario's frame, the first one beside the ego.
       valid: `[C]` bool.
       lane: `[C]` int32 first lane, -1 where not valid.
+      sequence: `[C, S]` int32 lanes from the first one on, -1 padded.
+      begin: `[C]` arc length of the first lane before the line's first point, m.
       overflow: `[]` bool, there are more candidates or points than room.
     """
 
     line: Polyline
     valid: Array
     lane: Array
+    sequence: Array
+    begin: Array
     overflow: Array
 
 
@@ -95,9 +99,9 @@ def route_lines(
         begin = project(line, ego.x, ego.y)
         x, y, _ = interpolate(line, begin + steps)
         count = 1 + jnp.floor((line.length - begin) / POINT_SPACING).astype(jnp.int32)
-        return x, y, jnp.clip(count, 1, config.num_points)
+        return x, y, jnp.clip(count, 1, config.num_points), begin
 
-    x, y, count = jax.vmap(points)(path)
+    x, y, count, begin = jax.vmap(points)(path)
     dx, dy = jnp.diff(x, axis=1), jnp.diff(y, axis=1)
     heading = jnp.arctan2(dy, dx)
     # The last point takes over the heading of the step before it.
@@ -115,6 +119,8 @@ def route_lines(
         line=Polyline(x, y, heading, count),
         valid=valid,
         lane=jnp.where(valid, first[branch], -1).astype(jnp.int32),
+        sequence=route.branch_lanes[branch],
+        begin=begin,
         overflow=overflow,
     )
 

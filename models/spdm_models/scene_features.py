@@ -217,12 +217,12 @@ def recorded_futures(
     ego = jax.tree.map(lambda v: v[now], scene.ego)
     future = jax.tree.map(lambda v: v[index], scene.ego)
     there = scene.ego_valid[index] & ~beyond
-    poses = jnp.stack(_local_pose(future.x, future.y, future.heading, ego), axis=-1)
+    poses = jnp.stack(local_pose(future.x, future.y, future.heading, ego), axis=-1)
     rows = neighbors.track[:count]
     tracks = scene.tracks
     seen = tracks.valid[rows][:, index] & ~beyond & neighbors.valid[:count, None]
     pick = lambda values: values[rows][:, index]
-    others = _local_pose(pick(tracks.x), pick(tracks.y), pick(tracks.heading), ego)
+    others = local_pose(pick(tracks.x), pick(tracks.y), pick(tracks.heading), ego)
     return (
         jnp.where(there[:, None], poses, 0),
         jnp.where(seen[..., None], jnp.stack(others, axis=-1), 0),
@@ -239,12 +239,13 @@ def _local_point(x, y, ego: EgoState):
     return dx * cos + dy * sin, dy * cos - dx * sin
 
 
-def _local_pose(x, y, heading, ego: EgoState):
+def local_pose(x, y, heading, ego: EgoState):
+    """Poses in the frame of the ego's rear axle: x, y, heading."""
     return *_local_point(x, y, ego), wrap(heading - ego.heading)
 
 
 def _ego_past(past: EgoState, ego: EgoState) -> jax.Array:
-    pose = _local_pose(past.x, past.y, past.heading, ego)
+    pose = local_pose(past.x, past.y, past.heading, ego)
     return jnp.stack([*pose, past.vx, past.vy, past.ax, past.ay], axis=-1)
 
 
@@ -255,7 +256,7 @@ def _neighbors_past(tracks: Tracks, neighbors: Neighbors, ego: EgoState) -> jax.
     known = jnp.where(valid, steps, steps.shape[0] - 1)
     source = jax.lax.cummin(known, axis=1, reverse=True)
     pick = lambda values: jnp.take_along_axis(values[neighbors.track], source, axis=1)
-    x, y, heading = _local_pose(pick(tracks.x), pick(tracks.y), pick(tracks.heading), ego)
+    x, y, heading = local_pose(pick(tracks.x), pick(tracks.y), pick(tracks.heading), ego)
     cos, sin = jnp.cos(ego.heading), jnp.sin(ego.heading)
     vx, vy = pick(tracks.vx), pick(tracks.vy)
     kind = tracks.type[neighbors.track]

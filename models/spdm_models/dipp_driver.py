@@ -1,0 +1,114 @@
+"""DIPP with its own network in the closed loop."""
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+
+from spdm_jax.agents.forecast import React
+from spdm_jax.config import NUM_TRAJECTORY_STATES, PlannerParams
+from spdm_jax.planner import StepInput
+from spdm_jax.simulation.drivers import Driven, Driver
+from spdm_jax.types import Scenario
+
+from . import dipp
+from .dipp import DIPPConfig
+from .dipp_features import DIPPFeatureConfig, dipp_features
+from .dipp_on_gameformer import DIPPRefinerConfig
+from .dipp_planner import TEST_SOLVER, DIPPPlannerConfig, bicycle, problem_from_features, solve
+from .gameformer_planner import own_center_path
+from .params import Params
+from .plan_frame import continued, plan_in_scene
+from .predictions import Prediction, futures_of
+from .scene_features import FeatureConfig, History, recorded_history
+from .sight import look
+
+
+@dataclass(frozen=True)
+class DIPPDriverConfig:
+    """Static settings.
+
+    Attributes:
+      network: sizes of the network.
+      features: whom and what is seen.
+      inputs: of the network, made from that.
+      refiner: problem, solver and reference path.
+      prediction: what the problem takes for the neighbours' futures.
+    """
+
+    network: DIPPConfig = field(default_factory=DIPPConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    inputs: DIPPFeatureConfig = field(default_factory=DIPPFeatureConfig)
+    refiner: DIPPRefinerConfig = field(
+        default_factory=lambda: DIPPRefinerConfig(problem=DIPPPlannerConfig(), solver=TEST_SOLVER)
+    )
+    prediction: Prediction = "learned"
+
+    def __post_init__(self):
+        if self.network.horizon != self.refiner.problem.horizon:
+            raise ValueError(
+                f"the network's horizon is {self.network.horizon} steps, the problem's "
+                f"{self.refiner.problem.horizon}"
+            )
+
+
+def dipp_driver(params: Params, config: DIPPDriverConfig) -> Driver:
+    """DIPP; the state is what was seen in the last 2 s, so it must be asked at every step.
+
+    The best-scored joint future gives the first plan and the predictions. The plan ends after 5 s;
+    chosen: it goes straight on from there at its last speed. Off the route, where there is no line
+    to follow, the network's controls are driven as they are. In reactive traffic perfect
+    predictions are the reactions to the network's plan.
+
+    Args:
+      params: weights of the network; make the driver inside `jit`, so that they are no constants
+        of the program.
+      config: static settings.
+    """
+    count, problem_config = config.inputs.neighbors, config.refiner.problem
+    steps = problem_config.horizon
+
+    def step(
+        scene: Scenario,
+        given: StepInput,
+        time: jax.Array,
+        state: History,
+        react: React | None = None,
+    ) -> Driven:
+        ego, vehicle = given.ego, PlannerParams().vehicle
+        sight = look(scene, given, state, config.features)
+        inputs = dipp_features(
+            scene.map, given.observation.lights, ego, sight.features, vehicle, config.inputs
+        )
+        output = dipp.apply(params, config.network, inputs)
+        best = jnp.argmax(output.scores)
+        controls = output.controls[best]
+        zero = jnp.zeros_like(ego.x)
+
+        def driven(controls):
+            limit = problem_config.max_steering
+            speed = jnp.hypot(ego.vx, ego.vy)
+            motion = bicycle(controls, zero, zero, zero, speed, max_steering=limit)
+            return jnp.stack([motion.x, motion.y, motion.heading], axis=-1)
+
+        beside = futures_of(config.prediction, scene, given, sight.neighbors, count, steps, react)
+        first = driven(controls)
+        futures = output.predictions[best] if beside is None else beside(first[None])[0]
+        center, found = own_center_path(scene, given, config.refiner)
+        # The curvature column is not read.
+        rows = (center.path, jnp.zeros_like(center.info)[:, None], center.info[:, None])
+        problem = problem_from_features(
+            inputs.ego[-1],
+            inputs.neighbors[:, -1],
+            futures,
+            jnp.concatenate(rows, axis=-1),
+            output.cost_weights,
+        )
+        solution = solve(controls, problem, config.refiner.solver, problem_config)
+        refined = driven(solution.values.reshape(steps, 2))
+        poses = continued(jnp.where(found, refined, first), NUM_TRAJECTORY_STATES - 1)
+        plan = plan_in_scene(poses, ego, time)
+        return Driven(plan, sight.history, found & center.overflow)
+
+    init = lambda scene: recorded_history(scene, -1)
+    return Driver("DIPP", init, step, step if config.prediction == "perfect" else None)

@@ -1,0 +1,97 @@
+"""GameFormer, alone and with a refinement, in the closed loop."""
+
+import jax
+import jax.numpy as jnp
+
+from spdm_jax.agents.forecast import React
+from spdm_jax.config import NUM_STATES
+from spdm_jax.planner import StepInput
+from spdm_jax.simulation.drivers import Driven, Driver
+from spdm_jax.types import ProposalSet, Scenario
+
+from .gameformer_planner import GameFormerPlannerConfig, ego_modes, finish, predict
+from .params import Params
+from .plan_frame import in_scene, plan_in_scene
+from .scene_features import History, recorded_history
+from .sight import look
+
+
+def gameformer_driver(
+    name: str, params: Params, cost_weights: jax.Array, config: GameFormerPlannerConfig
+) -> Driver:
+    """GameFormer; the state is what was seen in the last 2 s, so it must be asked at every step.
+
+    Args:
+      name: for tables.
+      params: weights of the network; make the driver inside `jit`, so that they are no constants
+        of the program.
+      cost_weights: `[9]` of DIPP's problem; not read by the other refinements.
+      config: static settings.
+    """
+
+    def step(
+        scene: Scenario,
+        given: StepInput,
+        time: jax.Array,
+        state: History,
+        react: React | None = None,
+    ) -> Driven:
+        sight = look(scene, given, state, config.features)
+        predicted = predict(params, scene, given, sight, config, react)
+        plan = predicted.output.plan[None]
+        done = finish(plan, predicted, cost_weights, scene, given, sight, config)
+        return Driven(plan_in_scene(done.poses[0], given.ego, time), sight.history, done.overflow)
+
+    init = lambda scene: recorded_history(scene, -1)
+    return Driver(name, init, step, step if config.prediction == "perfect" else None)
+
+
+def gameformer_proposals(
+    params: Params,
+    cost_weights: jax.Array,
+    scene: Scenario,
+    given: StepInput,
+    history: History,
+    config: GameFormerPlannerConfig,
+    react: React | None = None,
+) -> tuple[ProposalSet, History, jax.Array]:
+    """The ego's M modes as proposals for the PDM scorer, each refined as the config asks.
+
+    Args:
+      params: weights of the network.
+      cost_weights: `[9]` of DIPP's problem.
+      scene: one scenario.
+      given: ego and objects of this step.
+      history: up to the step before.
+      config: static settings.
+      react: how traffic would react, in traffic that does.
+
+    Returns:
+      Proposals `[M, 41]` in the scene's frame, the history for the next step, and whether a fixed
+      buffer was too small, `[]` bool.
+    """
+    sight = look(scene, given, history, config.features)
+    predicted = predict(params, scene, given, sight, config, react)
+    modes = ego_modes(predicted)
+    done = finish(modes, predicted, cost_weights, scene, given, sight, config)
+    x, y, heading = (v[:, :NUM_STATES] for v in in_scene(done.poses, given.ego))
+    return as_proposals(x, y, heading), sight.history, done.overflow
+
+
+def as_proposals(x: jax.Array, y: jax.Array, heading: jax.Array) -> ProposalSet:
+    """Poses `[M, T]` as proposals of stage 2 without a lane; those that are not finite are not
+    valid."""
+    valid = jnp.all(jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(heading), axis=1)
+    keep = lambda values: jnp.where(valid[:, None], values, 0)
+    count = x.shape[0]
+    index = jnp.arange(count, dtype=jnp.int32)
+    return ProposalSet(
+        x=keep(x),
+        y=keep(y),
+        heading=keep(heading),
+        valid=valid,
+        path=index,
+        policy=jnp.zeros_like(index),
+        stage=jnp.full_like(index, 2),
+        lane=jnp.full_like(index, -1),
+    )
