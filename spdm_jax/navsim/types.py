@@ -1,7 +1,7 @@
 """Typed pytrees of NAVSIM's score: one frame with its log, and the scores of trajectories in it.
 
 Conventions of `spdm_jax.types`. Axes besides: `F` = 11 log frames at 2 Hz (0 ... 5.0 s), `T` = 41
-scored states at 10 Hz, `M` red connectors, `V` their edges, `H` past samples.
+scored states at 10 Hz.
 """
 
 from flax import struct
@@ -9,12 +9,27 @@ from flax import struct
 from spdm_jax.config import VehicleParams
 from spdm_jax.geometry import Path
 from spdm_jax.scoring.areas import AreaMasks
+from spdm_jax.scoring.history_comfort import EgoPast
+from spdm_jax.scoring.lights import RedConnectors
 from spdm_jax.types import Array, EgoState, PolygonGrid
 
 NUM_POSES = 8
 """Poses of a predicted trajectory: 0.5 ... 4.0 s."""
 NUM_FRAMES = 11
 """Frames of the log: 0 ... 5.0 s at 2 Hz."""
+
+__all__ = [
+    "NUM_FRAMES",
+    "NUM_POSES",
+    "EgoPast",
+    "LoggedObjects",
+    "NavsimScene",
+    "NavsimScores",
+    "PreviousPlan",
+    "RedConnectors",
+    "Sampling",
+    "Terms",
+]
 
 
 class LoggedObjects(struct.PyTreeNode, kw_only=True):
@@ -39,22 +54,6 @@ class LoggedObjects(struct.PyTreeNode, kw_only=True):
     type: Array
 
 
-class RedConnectors(struct.PyTreeNode, kw_only=True):
-    """Lane connectors on the route that are red at some time.
-
-    Attributes:
-      edges: `[V, 4]` x0, y0, x1, y1 of their polygons, connector after connector.
-      start: `[M]` int32, first edge of each connector.
-      count: `[M]` int32, number of its edges (0 for padding).
-      red: `[M, F]` bool, status in each frame; a status holds until the next frame.
-    """
-
-    edges: Array
-    start: Array
-    count: Array
-    red: Array
-
-
 class Sampling(struct.PyTreeNode, kw_only=True):
     """How the 41 samples lie among the current pose and the eight predicted ones.
 
@@ -67,21 +66,6 @@ class Sampling(struct.PyTreeNode, kw_only=True):
 
     left: Array
     share: Array
-
-
-class EgoPast(struct.PyTreeNode, kw_only=True):
-    """Recorded past every 0.1 s, ending before the current state (NAVSIM leaves out the last one).
-
-    Attributes:
-      heading: `[H]` unwrapped; the last `count` entries are real.
-      ax, ay: `[H]` rear-axle acceleration in the body frame, m/s^2.
-      count: `[]` int32, 0 where no past is known.
-    """
-
-    heading: Array
-    ax: Array
-    ay: Array
-    count: Array
 
 
 class PreviousPlan(struct.PyTreeNode, kw_only=True):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spdm_jax.config import ScoringParams
+from spdm_jax.config import Scalar, ScoringParams
 from spdm_jax.types import Array
 
 
@@ -42,11 +42,10 @@ def aggregate(
     comfort) / 12; where nobody's m x progress exceeds 0.1 m, progress is 1 if m is not 0.
     """
     multiplier = xp.where(valid, multiplier, 0)
-    weighted = progress_raw * multiplier
-    best = xp.max(weighted)
-    moved = best > params.progress_threshold
-    relative = weighted / xp.where(moved, best, 1)
-    progress = xp.where(moved, relative, xp.where(multiplier != 0, 1.0, 0.0))
+    best = xp.max(progress_raw * multiplier)
+    progress = relative_progress(
+        progress_raw, multiplier, best, params.progress_threshold, multiplied=True, xp=xp
+    )
     weights = params.progress_weight + params.ttc_weight + params.comfort_weight
     total = (
         multiplier
@@ -59,6 +58,33 @@ def aggregate(
     )
     dtype = progress_raw.dtype
     return Aggregate(progress.astype(dtype), total.astype(dtype))
+
+
+def relative_progress(
+    progress_raw: Array,
+    multiplier: Array,
+    best: Array,
+    threshold: Scalar,
+    *,
+    multiplied: bool,
+    xp: ModuleType = jnp,
+) -> Array:
+    """Progress as a share of the best, `[P]`; where nobody made any, all are equally good.
+
+    Args:
+      progress_raw: `[P]` m.
+      multiplier: `[P]` product of the multipliers.
+      best: `[]` or `[P]` largest progress x multiplier of those compared, m.
+      threshold: m; up to it nobody made progress.
+      multiplied: the share is of progress x multiplier, and 0 where the multiplier is
+        (tuplan_garage, NAVSIM v1); else of the raw progress, at most 1 (NAVSIM v2).
+      xp: array module.
+    """
+    moved = best > threshold
+    share = (progress_raw * multiplier if multiplied else progress_raw) / xp.where(moved, best, 1)
+    if multiplied:
+        return xp.where(moved, share, xp.where(multiplier != 0, 1.0, 0.0))
+    return xp.where(moved, xp.clip(share, 0, 1), 1.0)
 
 
 def aggregate_sets(

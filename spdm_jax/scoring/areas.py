@@ -14,7 +14,7 @@ class AreaMasks(NamedTuple):
 
     Attributes:
       drivable: polygons of this step's drivable map (lanes and car parks near the ego).
-      on_route: those that belong to the route.
+      on_route: those of the drivable map that belong to the route.
       intersection: intersection areas.
       lanes: lanes, where they are told apart by other bits than the drivable map; None takes its.
     """
@@ -37,6 +37,13 @@ class EgoAreas(NamedTuple):
     multiple_lanes: jax.Array
     non_drivable: jax.Array
     oncoming: jax.Array
+
+
+class Crossings(NamedTuple):
+    """Whether a point of the ego lies in an intersection, `[P, T]` bool each."""
+
+    rear_axle: jax.Array
+    center: jax.Array
 
 
 class Areas(NamedTuple):
@@ -116,15 +123,15 @@ def areas_at(scene_map: ScenarioMap, x: jax.Array, y: jax.Array) -> Areas:
 
 def ego_areas(
     grid: PolygonGrid, masks: AreaMasks, ego: EgoState, box: Box
-) -> tuple[EgoAreas, jax.Array]:
+) -> tuple[EgoAreas, Crossings]:
     """Classifies ego states `[P, T]` and their boxes.
 
-    With c_j corners in polygon j: multiple lanes = more than one j with c_j > 0 and none with c_j =
-    4; non-drivable = a corner in no polygon; oncoming = centre in no on-route polygon (so off-road
-    counts as oncoming too).
+    With c_j corners in lane j: multiple lanes = more than one j with c_j > 0 and none with c_j = 4;
+    non-drivable = a corner in no drivable polygon; oncoming = centre in no on-route polygon (so
+    off-road counts as oncoming too).
 
     Returns:
-      The flags, and whether the rear axle lies in an intersection, `[P, T]` bool.
+      The flags, and which points lie in an intersection.
 
     Source: tuplan_garage `PDMScorer._calculate_ego_areas`.
     """
@@ -135,15 +142,16 @@ def ego_areas(
     touched = jnp.zeros(box.x.shape, jnp.int32)
     whole = jnp.zeros(box.x.shape, bool)
     on_route = jnp.zeros(box.x.shape, bool)
-    crossing = jnp.zeros(box.x.shape, bool)
+    crossing = jnp.zeros((2, *box.x.shape), bool)
     corner_inside = jnp.zeros((4, *box.x.shape), bool)
     for w, word in enumerate(containing_polygons(grid, x, y)):
         drivable = word & masks.drivable[w]
-        a, b, c, d = (drivable[i] for i in range(4))
+        lanes = drivable if masks.lanes is None else word & masks.lanes[w]
+        a, b, c, d = (lanes[i] for i in range(4))
         touched += jax.lax.population_count(a | b | c | d).astype(jnp.int32)
         whole |= (a & b & c & d) != 0
         corner_inside |= drivable[:4] != 0
-        on_route |= (drivable[4] & masks.on_route[w]) != 0
-        crossing |= (word[5] & masks.intersection[w]) != 0
+        on_route |= (word[4] & masks.on_route[w]) != 0
+        crossing |= (word[4:] & masks.intersection[w]) != 0
     areas = EgoAreas((touched > 1) & ~whole, ~jnp.all(corner_inside, axis=0), ~on_route)
-    return areas, crossing
+    return areas, Crossings(rear_axle=crossing[1], center=crossing[0])

@@ -15,6 +15,7 @@ from spdm_jax.arrays import true_indices, visit_true
 from spdm_jax.config import DT, ScoringParams, VehicleParams
 from spdm_jax.geometry import Box, box_at, boxes_overlap, ego_box
 from spdm_jax.scoring.areas import EgoAreas
+from spdm_jax.scoring.profile import TUPLAN, Profile
 from spdm_jax.types import AgentForecast, CollisionKind, EgoState
 
 LOOK_AHEAD = (0, 3, 6, 9)
@@ -39,12 +40,16 @@ class Contacts(NamedTuple):
     ttc: jax.Array
 
 
-def object_boxes(forecast: AgentForecast, num_steps: int) -> tuple[Box, jax.Array]:
+def object_boxes(
+    forecast: AgentForecast, num_steps: int, profile: Profile = TUPLAN
+) -> tuple[Box, jax.Array]:
     """Boxes `[A, F, T]` at time t + LOOK_AHEAD[f], and whether each can be met at all.
 
-    Occupancy maps exist every 0.2 s; a query for step k uses map k // 2.
+    A query for step k uses sample k // `profile.samples_every`; beyond the last one there is
+    nothing to be met.
     """
-    sample = (np.arange(num_steps) + np.array(LOOK_AHEAD)[:, None]) // 2
+    wanted = (np.arange(num_steps) + np.array(LOOK_AHEAD)[:, None]) // profile.samples_every
+    sample = np.minimum(wanted, forecast.heading.shape[1] - 1)
     heading = forecast.heading[:, sample]
     box = Box(
         forecast.x[:, sample],
@@ -55,11 +60,15 @@ def object_boxes(forecast: AgentForecast, num_steps: int) -> tuple[Box, jax.Arra
         0.5 * forecast.width[:, None, None],
     )
     alive = (forecast.valid & ~forecast.ignored)[:, None, None]
-    return box, alive & forecast.sample_valid[:, sample]
+    return box, alive & forecast.sample_valid[:, sample] & (wanted == sample)
 
 
 def first_contacts(
-    ego: EgoState, forecast: AgentForecast, vehicle: VehicleParams, params: ScoringParams
+    ego: EgoState,
+    forecast: AgentForecast,
+    vehicle: VehicleParams,
+    params: ScoringParams,
+    profile: Profile = TUPLAN,
 ) -> Contacts:
     """Finds the first contact of every proposal with every object.
 
@@ -68,6 +77,7 @@ def first_contacts(
       forecast: objects `[A, S]`.
       vehicle: ego dimensions.
       params: thresholds.
+      profile: spacing of the forecast's samples and steps of time to collision.
 
     Returns:
       `Contacts` `[P, A]`.
@@ -75,15 +85,17 @@ def first_contacts(
     num, steps = ego.x.shape
     box = jax.tree.map(jnp.transpose, ego_box(ego, vehicle))  # [T, P]
     speed = jnp.hypot(ego.vx, ego.vy).T
-    moving = speed >= params.ttc_stopped_speed
+    index = jnp.arange(steps, dtype=jnp.int32)[:, None]
+    moving = (speed >= params.ttc_stopped_speed) & (index < profile.ttc_steps)
     reach = [DT * f * speed for f in LOOK_AHEAD]
     shift_x = jnp.stack([box.x + r * box.cos for r in reach])  # [F, T, P]
     shift_y = jnp.stack([box.y + r * box.sin for r in reach])
-    objects, alive = object_boxes(forecast, steps)
+    objects, alive = object_boxes(forecast, steps, profile)
+    # Beyond the steps that are judged only the collision itself, at f = 0, is looked at.
+    alive &= (np.arange(steps) < profile.ttc_steps) | (np.arange(_NUM_AHEAD) == 0)[:, None]
     near = alive & _near_any(shift_x, shift_y, box, objects)  # [A, F, T]
     num_objects = near.shape[0]
     never = jnp.int32(steps * _NUM_AHEAD)
-    index = jnp.arange(steps, dtype=jnp.int32)[:, None]
     rows, _ = true_indices(jnp.any(near, axis=(1, 2)), num_objects)
     count = jnp.sum(jnp.any(near, axis=(1, 2)), dtype=jnp.int32)
 
@@ -241,6 +253,7 @@ def collision_kind(
     time: jax.Array,
     vehicle: VehicleParams,
     params: ScoringParams,
+    profile: Profile = TUPLAN,
 ) -> jax.Array:
     """`CollisionKind` of contacts, int32 `[...]`.
 
@@ -252,13 +265,14 @@ def collision_kind(
       time: `[...]` time index of the contact.
       vehicle: ego dimensions.
       params: thresholds.
+      profile: spacing of the forecast's samples.
 
     Source: nuPlan `get_collision_type`.
     """
     at = lambda values: values[proposal, time]
     x, y, heading = at(ego.x), at(ego.y), at(ego.heading)
     speed = jnp.hypot(at(ego.vx), at(ego.vy))
-    sample = time // 2
+    sample = time // profile.samples_every
     other = box_at(
         forecast.x[item, sample],
         forecast.y[item, sample],
@@ -294,6 +308,7 @@ def no_at_fault_collision(
     contacts: Contacts,
     vehicle: VehicleParams,
     params: ScoringParams,
+    profile: Profile = TUPLAN,
 ) -> CollisionResult:
     """Judges first contacts.
 
@@ -308,7 +323,7 @@ def no_at_fault_collision(
 
     def violates(proposal, item):
         time = jnp.minimum(contacts.time[proposal, item], steps - 1)
-        kind = collision_kind(ego, forecast, proposal, item, time, vehicle, params)
+        kind = collision_kind(ego, forecast, proposal, item, time, vehicle, params, profile)
         at_fault = (
             (kind == CollisionKind.STOPPED_TRACK)
             | (kind == CollisionKind.ACTIVE_FRONT)
@@ -319,7 +334,8 @@ def no_at_fault_collision(
     time, item, score = _judge(contacts.time < steps, violates, steps)
     hit = item >= 0
     row, first = jnp.arange(ego.x.shape[0]), jnp.minimum(time, steps - 1)
-    kind = collision_kind(ego, forecast, row, jnp.maximum(item, 0), first, vehicle, params)
+    who = jnp.maximum(item, 0)
+    kind = collision_kind(ego, forecast, row, who, first, vehicle, params, profile)
     return CollisionResult(score.astype(ego.x.dtype), time, item, jnp.where(hit, kind, -1))
 
 
@@ -344,6 +360,7 @@ def time_to_collision(
     forecast: AgentForecast,
     contacts: Contacts,
     params: ScoringParams,
+    profile: Profile = TUPLAN,
 ) -> TTCResult:
     """Judges the first projected contact with each object.
 
@@ -357,6 +374,7 @@ def time_to_collision(
       forecast: objects.
       contacts: first contacts.
       params: thresholds.
+      profile: spacing of the forecast's samples.
 
     Source: tuplan_garage `PDMScorer._calculate_ttc`.
     """
@@ -367,7 +385,8 @@ def time_to_collision(
     def violates(proposal, item):
         key = jnp.minimum(contacts.ttc[proposal, item], never - 1)
         time = key // _NUM_AHEAD
-        sample = (time + jnp.asarray(LOOK_AHEAD, jnp.int32)[key % _NUM_AHEAD]) // 2
+        ahead = jnp.asarray(LOOK_AHEAD, jnp.int32)[key % _NUM_AHEAD]
+        sample = (time + ahead) // profile.samples_every
         at = lambda values: values[proposal, time]
         x, y = forecast.x[item, sample], forecast.y[item, sample]
         cos = cos_to_object(at(ego.x), at(ego.y), at(ego.heading), x, y)

@@ -48,7 +48,7 @@ def savgol_matrix(size: int, window: int, order: int, derivative: int) -> np.nda
 
 
 def _apply(matrix: np.ndarray, signal: jax.Array) -> jax.Array:
-    return _rounded(filtered(matrix, signal))
+    return rounded(filtered(matrix, signal))
 
 
 def filtered(matrix: np.ndarray, signal: jax.Array) -> jax.Array:
@@ -57,8 +57,8 @@ def filtered(matrix: np.ndarray, signal: jax.Array) -> jax.Array:
     return jnp.matmul(signal, operator.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def _rounded(signal: jax.Array) -> jax.Array:
-    # nuPlan rounds to 8 decimals, which float32 cannot hold.
+def rounded(signal: jax.Array) -> jax.Array:
+    """Rounds to 8 decimals as nuPlan does; float32 cannot hold them and stays as it is."""
     return jnp.round(signal, 8) if signal.dtype == jnp.float64 else signal
 
 
@@ -113,8 +113,12 @@ def comfort_bounds(params: ScoringParams) -> dict[str, tuple[Scalar, Scalar]]:
 
 def comfort_flags(ego: EgoState, params: ScoringParams) -> jax.Array:
     """Whether each of the six signals stays strictly inside its bounds, `[P, 6]` bool."""
+    return within_bounds(comfort_signals(ego), params)
+
+
+def within_bounds(signals: dict[str, jax.Array], params: ScoringParams) -> jax.Array:
+    """Whether named signals `[P, T]` stay strictly inside their bounds, `[P, 6]` bool."""
     bounds = comfort_bounds(params)
-    signals = comfort_signals(ego)
     return jnp.stack(
         [
             jnp.all((signal > bounds[name][0]) & (signal < bounds[name][1]), axis=-1)

@@ -90,8 +90,10 @@ def soft_score_trajectories(
     hard = world.hard
     fixed = jax.lax.stop_gradient(ego)
     box = ego_box(ego, vehicle)
-    areas, crossing = ego_areas(hard.grid, hard.masks, fixed, ego_box(fixed, vehicle))
-    margins = contact_margins(ego, areas, crossing, hard.forecast, vehicle, params, temperature)
+    areas, crossings = ego_areas(hard.grid, hard.masks, fixed, ego_box(fixed, vehicle))
+    margins = contact_margins(
+        ego, areas, crossings.rear_axle, hard.forecast, vehicle, params, temperature
+    )
     collision = _sigmoid(margins.agent) * (0.5 + 0.5 * _sigmoid(margins.static))
 
     road = (
