@@ -27,6 +27,7 @@ from spdm_experiments.options import (
     Sweep,
     Vocab,
 )
+from spdm_experiments.train_options import Train
 
 EXIT_FAILED = 1
 """The command ran, and something in it failed (a scenario, a check)."""
@@ -46,14 +47,17 @@ def main(argv: Sequence[str] | None = None) -> int:
       SystemExit: help was asked for, or the options are wrong (code 2).
     """
     options = tyro.cli(
-        Options, prog="spdm", args=argv, description="Driving-proposal planning and PDM scoring."
+        Options | Train,
+        prog="spdm",
+        args=argv,
+        description="Driving-proposal planning and PDM scoring.",
     )
     try:
         return 0 if run(options) else EXIT_FAILED
     except KeyboardInterrupt:
         resumes = isinstance(options, Pack) and not options.overwrite
         hint = "; the same command goes on where it stopped" if resumes else ""
-        if isinstance(options, Label | Simulate | Sweep):
+        if isinstance(options, Label | Simulate | Sweep | Train):
             hint = f"; go on with: spdm {shlex.join(sys.argv[1:] if argv is None else argv)}"
         print(f"spdm: interrupted{hint}", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -65,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_ERROR
 
 
-def run(options: Options) -> bool:
+def run(options: Options | Train) -> bool:
     """Runs one verb; returns False if something in it failed."""
     match options:
         case Convert():
@@ -90,6 +94,8 @@ def run(options: Options) -> bool:
             return commands.simulate(options)
         case Sweep():
             return commands.sweep(options)
+        case Train():
+            return commands.train(options)
         case Vocab():
             return commands.vocab(options)
 

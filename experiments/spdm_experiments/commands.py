@@ -22,6 +22,7 @@ from spdm_experiments.options import (
     Sweep,
     Vocab,
 )
+from spdm_experiments.train_options import Train
 
 if TYPE_CHECKING:
     from spdm_jax.io.pack import PackReport
@@ -141,6 +142,13 @@ def simulate(options: Simulate) -> bool:
     from spdm_experiments.simulate import run_simulate
 
     return run_simulate(options)
+
+
+def train(options: Train) -> bool:
+    """Trains a learned planner; False if a scenario gave nothing to learn from."""
+    from spdm_experiments.train import run_train
+
+    return run_train(options)
 
 
 def report(options: Report) -> bool:

@@ -1,23 +1,17 @@
 """The scenarios of `spdm simulate`: a built-in suite, packed once, or files that are there."""
 
 import dataclasses
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
 from spdm_experiments.chunks import scenario_files, suite_name
 from spdm_experiments.inventory import Inventory
 from spdm_experiments.options import Simulate
+from spdm_experiments.packed_suites import packed_suite
 from spdm_experiments.sequence import usable_inventory
 from spdm_experiments.simulate_scripts import Extras, find_extras
-from spdm_experiments.sources import Selection
-from spdm_experiments.terminal import progress_line
 from spdm_jax import Failure
-from spdm_jax.compile_cache import default_folder
-from spdm_jax.io import raw
-from spdm_jax.io.pack import pack
 from spdm_jax.synthetic import suites
-from spdm_jax.types import SCHEMA_VERSION
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,24 +88,5 @@ def _packed_suite(name: str, options: Simulate) -> tuple[Path, list[Path]]:
     wanted = set(options.types) or set(suites.SUITES[name])
     tokens = [token for token in reader.tokens() if token.rpartition("-")[0] in wanted]
     tokens = tokens[: options.limit]
-    folder = default_folder() / "suites" / f"{name}-{_source_digest()}"
-    if missing := [token for token in tokens if not (folder / f"{token}.npz").exists()]:
-        with progress_line(f"packing {name}", len(missing)) as advance:
-            report = pack(
-                Selection(reader, missing, None),
-                folder,
-                progress=lambda done, total, token, outcome: advance(done),
-            )
-        if report.failed:
-            token, reason = next(iter(report.failed.items()))
-            raise ValueError(f"suite {name}: {token}: {reason}")
+    folder = packed_suite(reader, name, tokens)
     return folder, [folder / f"{token}.npz" for token in tokens]
-
-
-def _source_digest() -> str:
-    """Digest of the code that makes the files of a suite: other code makes others."""
-    digest = hashlib.sha256(str(SCHEMA_VERSION).encode())
-    for module in (suites, raw):
-        for path in sorted(Path(module.__file__ or "").parent.glob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]

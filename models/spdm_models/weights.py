@@ -78,7 +78,13 @@ def load_weights(
     return config, from_state_dict(state, template, extras, str(path), dtype)
 
 
-def save_weights(path: Path, model: ModelName, config: Config, params: Params) -> None:
+def save_weights(
+    path: Path,
+    model: ModelName,
+    config: Config,
+    params: Params,
+    training: Mapping[str, Any] | None = None,
+) -> None:
     """Writes variables as `.safetensors` under torch's names, with the configuration inside.
 
     Args:
@@ -86,12 +92,14 @@ def save_weights(path: Path, model: ModelName, config: Config, params: Params) -
       model: what the variables belong to.
       config: sizes of the model.
       params: its variables.
+      training: where they come from, in JSON; for the file's header.
 
     Raises:
       ValueError: the file's ending is another.
     """
     state = to_state_dict(params, _FAMILIES[model].extras(config))
-    write_checkpoint(path, state, {"model": model, "config": asdict(config)})
+    about = {"model": model, "config": asdict(config)}
+    write_checkpoint(path, state, {**about, "training": dict(training)} if training else about)
 
 
 def _config(kind: type[Config], fields: Mapping[str, Any]) -> Config:
