@@ -7,7 +7,7 @@ functions underneath are in `spdm_jax.functional`.
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
@@ -31,10 +31,15 @@ from spdm_jax.io.build import build_scenario, start_at
 from spdm_jax.io.crop import MapIndex
 from spdm_jax.io.raw import RawScenario, ScenarioError
 from spdm_jax.io.scenario_file import read_scenario
+from spdm_jax.navsim.evaluate import score_frames
+from spdm_jax.navsim.frames import NavsimSet
+from spdm_jax.navsim.from_scenario import from_scenarios
+from spdm_jax.navsim.results import NavsimScoreSet
 from spdm_jax.padding import PATH_ROOM, PaddingConfig, batch, bucket, check_buckets, sizes_of
 from spdm_jax.proposals.lanes import area_masks, drivable_lanes
 from spdm_jax.results import Failure, PlanSet, ScenarioSet, ScoreSet
 from spdm_jax.scoring.aggregate import aggregate_sets
+from spdm_jax.scoring.profile import profile_named
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.tracking.lqr import track
 from spdm_jax.trajectories import (
@@ -377,11 +382,69 @@ def _score_in_blocks(
     return scores, tracked, seen, overflow
 
 
+def to_navsim(
+    scenes: ScenarioSet | NavsimSet,
+    *,
+    precision: Precision = "f32",
+    batching: BatchConfig | None = None,
+) -> NavsimSet:
+    """Makes NAVSIM's frames of scenarios: iteration 0 of each, once for a set and a precision.
+
+    Args:
+      scenes: from `load` or `from_raw`; frames are returned as they are.
+      precision: of PDM-Closed, which plans the reference trajectory.
+      batching: how scenes are spread over cores and devices.
+
+    Raises:
+      ValueError: no scenario records enough.
+    """
+    if isinstance(scenes, NavsimSet):
+        return scenes
+    made = vars(scenes).setdefault("_as_navsim", {})
+    if precision not in made:
+        config = fit_config(scenes, PlannerConfig())
+        made[precision] = from_scenarios(scenes, config, precision=precision, batching=batching)
+    return made[precision]
+
+
+def refuse_foreign(**options: Any) -> None:
+    """Refuses options that NAVSIM's profiles would silently ignore.
+
+    Raises:
+      ValueError: names the first one that was given.
+    """
+    for name, value in options.items():
+        if value is not None and not (name == "tracker" and value == "reference"):
+            raise ValueError(
+                f"{name} does not apply to NAVSIM's profiles: they replay the log and track with "
+                f"the reference's tracker. Leave {name} out"
+            )
+
+
+def _of_frames(values: Any, axes: int, scenes: ScenarioSet | NavsimSet, frames: NavsimSet) -> Any:
+    """Leaves out what belongs to scenarios that no frame could be made of.
+
+    Args:
+      values: one entry per scenario if it has at least `axes` axes.
+      axes: see above.
+      scenes: as given.
+      frames: made of them.
+    """
+    if len(frames) == len(scenes) or np.ndim(values) < axes:
+        return values
+    kept = set(frames.tokens)
+    return as_array(values)[[info.token in kept for info in scenes.infos]]
+
+
+NavsimProfile = Literal["navsim1", "navsim2", "navsim2_unfiltered"]
+
+
+@overload
 def score(
-    scenes: ScenarioSet,
+    scenes: ScenarioSet | NavsimSet,
     trajectories,
     *,
-    dt: float = 0.1,
+    dt: float | None = None,
     frame: Frame = "ego",
     tracker: Tracker | Literal["none"] = "reference",
     config: PlannerConfig | None = None,
@@ -389,16 +452,50 @@ def score(
     precision: Precision = "f32",
     forecast=None,
     batching: BatchConfig | None = None,
-) -> ScoreSet:
+    profile: Literal["tuplan"] = "tuplan",
+) -> ScoreSet: ...
+
+
+@overload
+def score(
+    scenes: ScenarioSet | NavsimSet,
+    trajectories,
+    *,
+    profile: NavsimProfile,
+    dt: float | None = None,
+    frame: Frame = "ego",
+    params: PlannerParams | None = None,
+    precision: Precision = "f32",
+    batching: BatchConfig | None = None,
+    previous=None,
+) -> NavsimScoreSet: ...
+
+
+def score(
+    scenes: ScenarioSet | NavsimSet,
+    trajectories,
+    *,
+    dt: float | None = None,
+    frame: Frame = "ego",
+    tracker: Tracker | Literal["none"] = "reference",
+    config: PlannerConfig | None = None,
+    params: PlannerParams | None = None,
+    precision: Precision = "f32",
+    forecast=None,
+    batching: BatchConfig | None = None,
+    profile: str = "tuplan",
+    previous=None,
+) -> ScoreSet | NavsimScoreSet:
     """Scores any trajectories with the PDM score.
 
     Args:
-      scenes: from `load` or `from_raw`.
+      scenes: from `load` or `from_raw`; for NAVSIM's profiles also from `load_navsim`.
       trajectories: `[B, P, T, 3]` rear-axle poses (x, y, heading), or `[P, T, 3]` for the same ones
         in every scene (a vocabulary), or full `[..., 11]` states, which are scored as they are.
         NumPy or JAX.
-      dt: their interval, s; resampled to 41 states at 0.1 s. Without the current pose (8 poses at
-        0.5 s) it is put in front.
+      dt: their interval, s (0.1 if None); resampled to 41 states at 0.1 s. Without the current
+        pose (8 poses at 0.5 s) it is put in front. NAVSIM's profiles take 0.5 for 8 poses if None,
+        and look at the poses at 0.5, 1.0, ... 4.0 s.
       frame: "ego" (x forward from the current rear axle), "local" (the scene's own) or "global"
         (map coordinates, float64).
       tracker: "reference" or "corrected" tracks poses with the LQR and the bicycle first, as PDM
@@ -408,13 +505,41 @@ def score(
       precision: "f32" or "f64".
       forecast: `[B, A, 41, 3]` supplied forecast instead of the configured one.
       batching: how scenes are spread over cores and devices.
+      profile: whose rules: "tuplan", "navsim1" (PDMS), "navsim2" (EPDMS) or "navsim2_unfiltered"
+        (without the human filter). NAVSIM's replay the log and track by the reference: `tracker`,
+        `config` and `forecast` do not apply.
+      previous: for "navsim2", plans of the frame before; see `navsim.evaluate.score_frames`.
 
     Returns:
-      `ScoreSet` with NumPy leaves `[B, P]`.
+      `ScoreSet` (or, for NAVSIM's profiles, `NavsimScoreSet`) with NumPy leaves `[B, P]`.
 
     Raises:
-      ValueError: shapes, steps or interval do not fit, or a value is not finite.
+      ValueError: shapes, steps or interval do not fit, a value is not finite, or an option does not
+        apply to the profile.
     """
+    if profile != "tuplan":
+        refuse_foreign(tracker=tracker, config=config, forecast=forecast)
+        rules = profile_named(profile)
+        frames = to_navsim(scenes, precision=precision, batching=batching)
+        return score_frames(
+            frames,
+            _of_frames(trajectories, 4, scenes, frames),
+            rules,
+            dt=dt,
+            frame=frame,
+            previous=_of_frames(previous, 3, scenes, frames),
+            params=None if params is None else params.scoring,
+            precision=precision,
+            batching=batching,
+        )
+    if previous is not None:
+        raise ValueError("previous is for profile='navsim2'; the tuplan score does not look at it")
+    if isinstance(scenes, NavsimSet):
+        raise ValueError(
+            "profile is 'tuplan', but the scenes are NAVSIM's frames; pass profile='navsim1' or "
+            "'navsim2', or scenarios"
+        )
+    dt = 0.1 if dt is None else dt
     config = config or PlannerConfig()
     if tracker not in ("reference", "corrected", "none"):
         raise ValueError(f"tracker is {tracker!r}; it must be 'reference', 'corrected' or 'none'")

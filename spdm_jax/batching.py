@@ -28,7 +28,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from spdm_jax.padding import PaddingConfig, bucket
 from spdm_jax.programs import program
 from spdm_jax.schema import LEAVES
-from spdm_jax.types import Scenario, ScenarioBatch
+from spdm_jax.types import ScenarioBatch
 
 Precision = Literal["f32", "f64"]
 S = TypeVar("S")
@@ -106,8 +106,8 @@ class SceneRunner:
 
     Args:
       function: `function(scene, mine, shared, static)`, at the top level of a module, pure, of one
-        scene. `mine` and `shared` are pytrees of arrays (or None): one entry per scene, and the
-        same for all.
+        scene: a `Scenario`, or another pytree of arrays with an `origin`. `mine` and `shared` are
+        pytrees of arrays (or None): one entry per scene, and the same for all.
       static: hashable settings; a new value compiles anew.
       precision: floating type of the scene's arrays and of `mine` and `shared`.
       config: chunks and devices.
@@ -115,7 +115,7 @@ class SceneRunner:
 
     def __init__(
         self,
-        function: Callable[[Scenario, Any, Any, Any], Any],
+        function: Callable[[Any, Any, Any, Any], Any],
         static: Hashable = None,
         *,
         precision: Precision = "f32",
@@ -131,7 +131,7 @@ class SceneRunner:
 
     def __call__(
         self,
-        batch: ScenarioBatch,
+        batch: Any,
         mine: Any = None,
         shared: Any = None,
         *,
@@ -154,7 +154,7 @@ class SceneRunner:
             mine, shared = _cast(mine, dtype), _cast(shared, dtype)
             batch = batch.replace(origin=np.zeros(np.shape(batch.origin), dtype))
             devices = self._devices()
-            scene_of = np.arange(len(batch.num_history)) if scene_of is None else scene_of
+            scene_of = np.arange(len(batch.origin)) if scene_of is None else scene_of
             if len(devices) == 1 and devices[0].platform == "cpu":
                 result = self._scene_by_scene(batch, mine, shared, scene_of, dtype, devices[0])
             else:

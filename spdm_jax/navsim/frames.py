@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from spdm_jax.navsim.batch import stack
 from spdm_jax.navsim.types import NavsimScene
 from spdm_jax.results import Failure
 from spdm_jax.scoring.profile import Profile
@@ -44,6 +47,7 @@ class NavsimSet:
     frames: list[NavsimScene]
     infos: list[NavsimInfo]
     failures: list[Failure] = field(default_factory=list)
+    _stacked: NavsimScene | None = field(default=None, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.infos)
@@ -57,6 +61,16 @@ class NavsimSet:
     def tokens(self) -> list[str]:
         """Of the frames, in their order."""
         return [info.token for info in self.infos]
+
+    def stacked(self) -> NavsimScene:
+        """Returns all frames padded to one shape, `[B, ...]`, for the device; made once.
+
+        Time stamps are left out: they were put to use when the frames were built.
+        """
+        if self._stacked is None:
+            none = np.zeros(len(self), np.int32)
+            self._stacked = stack(self.frames).replace(start_time_us=none)
+        return self._stacked
 
     def select(self, rows: Sequence[int]) -> NavsimSet:
         """Returns some of the frames, in the order of `rows`, without the failures."""

@@ -184,16 +184,16 @@ def road_scene(speed: float = 8.0) -> dict[str, np.ndarray]:
     """A straight road along x, in map coordinates, every array of an exported scene.
 
     Two lanes of 3.5 m, the right one (its centre at y = 0) on the route; an intersection from
-    x = 60 m on with a connector that is red from frame 4 on; a parked car ahead to the right and
+    x = 45 m on with a connector that is red from frame 4 on; a parked car ahead to the right and
     half in the lane at x = 30 m, one car in the left lane, a cone that is logged once. The
     reference drives on at constant speed.
     """
     areas = [
-        (0, False, rectangle(-60, 60, -1.75, 5.25)),
-        (1, True, rectangle(-60, 60, -1.75, 1.75)),
-        (1, False, rectangle(-60, 60, 1.75, 5.25)),
-        (2, True, rectangle(60, 90, -1.75, 1.75)),
-        (3, False, rectangle(60, 90, -12, 12)),
+        (0, False, rectangle(-60, 45, -1.75, 5.25)),
+        (1, True, rectangle(-60, 45, -1.75, 1.75)),
+        (1, False, rectangle(-60, 45, 1.75, 5.25)),
+        (2, True, rectangle(45, 90, -1.75, 1.75)),
+        (3, False, rectangle(45, 90, -12, 12)),
     ]
     rings = [ring + ORIGIN for _, _, ring in areas]
     time = np.arange(11) * 0.5
@@ -270,3 +270,12 @@ def replay(scene: Mapping[str, np.ndarray], samples: int) -> dict[str, np.ndarra
             pose[:, i] = np.stack(columns, axis=-1)
             valid[:, i] = (wanted > 0.5 * there[0] - 1e-9) & (wanted < 0.5 * there[-1] + 1e-9)
     return {**scene, "obj_pose": pose, "obj_valid": valid}
+
+
+def straight(*speeds: float, left: float = 0.0) -> np.ndarray:
+    """`[P, 8, 3]` straight ahead, reaching `left` m to the left at 4 s."""
+    share = np.arange(1, 9) / 8
+    poses = np.zeros((len(speeds), 8, 3))
+    poses[..., 0] = 4 * np.array(speeds)[:, None] * share
+    poses[..., 1] = left * share
+    return poses

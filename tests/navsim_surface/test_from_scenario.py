@@ -9,10 +9,11 @@ import shapely
 
 import small_road as roads
 import spdm_jax
-from spdm_jax.api import fit_config
+from navsim_stand_in import straight
+from spdm_jax.api import _of_frames, fit_config
 from spdm_jax.config import PlannerConfig
 from spdm_jax.navsim.build import from_arrays
-from spdm_jax.navsim.frames import NavsimSet
+from spdm_jax.navsim.frames import NavsimInfo, NavsimSet
 from spdm_jax.navsim.from_scenario import (
     Way,
     _without_holes,
@@ -164,3 +165,23 @@ def test_reference_difference_does_not_depend_on_the_origin(
     other = from_arrays(moved)
     assert (other.origin != frame.origin).any()
     np.testing.assert_allclose(reference_difference(frame, other), 0.0, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_scenarios_are_scored_by_every_profile(scenarios: ScenarioSet):
+    drives = straight(22.0, 0.0)
+    one = spdm_jax.score(scenarios, drives, profile="navsim1", precision="f64")
+    two = spdm_jax.score(scenarios, drives, profile="navsim2", precision="f64")
+    assert one.total.shape == two.total.shape == (2, 2)
+    assert two.traffic_light[1].tolist() == [0, 1] and one.traffic_light.all()
+    assert spdm_jax.to_navsim(scenarios, precision="f64") is spdm_jax.to_navsim(
+        scenarios, precision="f64"
+    )
+
+
+def test_trajectories_of_scenarios_without_a_frame_are_left_out(scenarios: ScenarioSet):
+    kept = NavsimSet([], [NavsimInfo("red_light-0", "", "synthetic", ())])
+    sets = np.arange(2.0)[:, None, None, None] * np.ones((2, 3, 8, 3))
+    np.testing.assert_array_equal(_of_frames(sets, 4, scenarios, kept), sets[1:])
+    assert _of_frames(sets[0], 4, scenarios, kept) is not None
+    assert _of_frames(None, 3, scenarios, kept) is None
