@@ -89,7 +89,8 @@ def main(argv: Sequence[str] | None = None, suites: Sequence[Suite] = SUITES) ->
     try:
         good = True
         if given.step == "run":
-            _note_machine(given.out, given.limit)
+            selected = "" if given.limit is None else f" --limit {given.limit}"
+            note_machine(given.out, f"python -m spdm_experiments.closed_loop{selected}")
             for suite in suites:
                 good &= drive(suite, replace(options, out=given.out / suite.name), given.limit)
         elif given.step == "precision":
@@ -132,16 +133,17 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def _note_machine(out: Path, limit: int | None) -> None:
-    """Keeps what run folders do not say of the machines that worked on them."""
+def note_machine(out: Path, command: str) -> None:
+    """Keeps, in `about.json`, what run folders do not say of the machines that worked on them.
+
+    Args:
+      out: folder of all runs.
+      command: what the page says they were made by.
+    """
     path = out / ABOUT
     before = json.loads(path.read_text(encoding="utf-8"))["machines"] if path.is_file() else []
     here = f"{processor()}, {usable_cores()} core(s), Python {platform.python_version()}"
-    selected = "" if limit is None else f" --limit {limit}"
-    content = {
-        "command": f"python -m spdm_experiments.closed_loop{selected}",
-        "machines": list(dict.fromkeys([*before, here])),
-    }
+    content = {"command": command, "machines": list(dict.fromkeys([*before, here]))}
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
 

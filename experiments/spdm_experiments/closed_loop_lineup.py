@@ -39,7 +39,7 @@ class Suite:
     Attributes:
       name: of the run folder.
       scenes: built-in suite or folder of scenario files.
-      traffic: kinds of traffic.
+      traffic: kinds of traffic; an entry of the line-up may name others.
       lineup: as `LINEUP`.
     """
 
@@ -52,7 +52,7 @@ class Suite:
         """Returns who drives, in the order of the tables, every point once."""
         points: dict[str, Point] = {}
         for choice in self.lineup:
-            options = Simulate(scenes=self.scenes, traffic=self.traffic, **choice)
+            options = Simulate(**{"scenes": self.scenes, "traffic": self.traffic, **choice})
             for point in make_points(options):
                 points.setdefault(repr(point.entry(0)), point)
         return list(points.values())

@@ -9,62 +9,40 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-Format = Literal["auto", "nuplan", "av2", "synthetic"]
-PlannerName = Literal["spdm", "pdm-closed"]
-SimulatedPlanner = Literal[
-    "spdm", "pdm-closed", "idm", "idm-mobil", "constant-velocity", "log-replay"
+from spdm_experiments.option_bases import (
+    Chunked,
+    Common,
+    Compute,
+    Forecast,
+    Format,
+    OnDevice,
+    OverGrid,
+    Planner,
+    PlannerName,
+)
+from spdm_experiments.simulate_options import Simulate
+
+__all__ = [
+    "Chunked",
+    "Compute",
+    "Convert",
+    "Demo",
+    "Doctor",
+    "Format",
+    "Label",
+    "OnDevice",
+    "Options",
+    "OverGrid",
+    "Pack",
+    "Plan",
+    "Planner",
+    "Report",
+    "Score",
+    "Show",
+    "Simulate",
+    "Sweep",
+    "Vocab",
 ]
-Forecast = Literal["constant_velocity", "perfect", "none"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Common:
-    """Options of every verb."""
-
-    debug: bool = False
-    """Show the traceback of an error."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnDevice(Common):
-    """Options of every verb that uses JAX."""
-
-    device: Literal["auto", "cpu", "gpu"] = "auto"
-    """Where to compute; auto takes the fastest kind present."""
-    compile_cache: bool = True
-    """Keep compiled programs between runs in a private folder (SPDM_COMPILE_CACHE names it)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Compute(OnDevice):
-    """Options of every verb that runs the planner or the scorer."""
-
-    precision: Literal["f32", "f64"] = "f32"
-    """Floating-point type of all computation."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Planner(Compute):
-    """Options of every verb that makes proposals."""
-
-    planner: PlannerName = "spdm"
-    """SPDM or the baseline PDM-Closed."""
-    num_proposals: int | None = None
-    """Proposals per scene: SPDM 15, 20, 25, ... (60 if left out); PDM-Closed 1, 3, 6, 15, 30 or 60
-    (15 if left out)."""
-    speeds: tuple[float, ...] = ()
-    """Target speeds as fractions of the speed limit; the planner's own grid if left out."""
-    offsets: tuple[float, ...] = ()
-    """Lateral offsets in m, left positive, the first 0; the planner's own grid if left out."""
-    tracker: Literal["reference", "corrected"] = "reference"
-    """Velocity fit of the tracker: as published, or with its difference matrix repaired."""
-    forecast: Forecast = "constant_velocity"
-    """Where the other agents' future comes from."""
-    progress_reference: Literal["auto", "centerline", "goal"] = "auto"
-    """What progress is measured along: the centreline (as published), the way to the goal, or the
-    first for PDM-Closed and the second for SPDM (auto)."""
-    borrow_oncoming: bool = False
-    """Let SPDM pass a standing obstacle through the oncoming lane."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,18 +125,6 @@ class Pack(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chunked(Compute):
-    """Options of every verb that goes through a folder of scenarios."""
-
-    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
-    """A folder of scenario files (see spdm pack), or one file."""
-    limit: int | None = None
-    """Take the first so many scenarios, in the order of their file names."""
-    chunk: int = 16
-    """Scenarios per device call: smaller needs less memory and reports more often."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Plan(Chunked, Planner):
     """Plan once per scenario, write the chosen trajectories and all proposals' scores.
 
@@ -221,26 +187,6 @@ class Show(Planner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OverGrid(Compute):
-    """Options of every verb that computes many scenarios at every point of a grid."""
-
-    scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
-    """A folder of scenario files (see spdm pack), or one file."""
-    out: Path = Path("out/run")
-    """Run folder to write or to go on with."""
-    limit: int | None = None
-    """Take the first so many scenarios, in the order of their file names."""
-    chunk: int | Literal["auto"] = "auto"
-    """Scenarios per part of the run folder; auto goes by memory."""
-    shard: str = "1/1"
-    """I/N: take every scenario that falls into part I of N. Parts need no contact with each other
-    and may share a folder."""
-    cluster: str | None = None
-    """Spread the work with Ray: "local" (or local:4, with four processes), "auto" for the cluster
-    this machine is part of, or an address."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Sweep(OverGrid):
     """Plan every scenario at every point of a grid of settings, write a row for each.
 
@@ -280,49 +226,6 @@ class Sweep(OverGrid):
     """Also write the chosen proposals' poses, in map coordinates."""
     stage_times: bool = False
     """Also time proposal generation, tracking and scoring for each number of proposals."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Simulate(OverGrid):
-    """Drive whole scenarios in simulation and score the drives with nuPlan's metrics.
-
-    Several values of an option make a product of runs; each scenario has a row for every one of
-    them. The same command goes on where an interrupted one stopped, also after a kill. A scenario
-    that fails is a row with its reason; the exit code is then 1.
-    """
-
-    scenes: Annotated[Positional[Path], arg(metavar="SUITE|SCENES")]
-    """A built-in suite (common-14, interactive-8), a folder of scenario files (see spdm pack), or
-    one file."""
-    planner: tuple[SimulatedPlanner, ...] = ("spdm",)
-    """Who drives the ego."""
-    num_proposals: tuple[int, ...] = ()
-    """Proposals per step: SPDM 15, 20, 25, ... (60 if left out); PDM-Closed 1, 3, 6, 15, 30 or 60
-    (15 if left out)."""
-    traffic: tuple[Literal["reactive", "replay"], ...] = ()
-    """Vehicles that drive by IDM and react to the ego (if left out), or all objects as
-    recorded."""
-    mode: tuple[Literal["closed", "open"], ...] = ("closed",)
-    """closed: the ego tracks its plans. open: the ego keeps to the record, and its plans are
-    compared with what the recorded driver did next."""
-    forecast: tuple[Forecast, ...] = ()
-    """Where PDM-Closed and SPDM take the other agents' future from."""
-    progress: tuple[Literal["auto", "centerline", "goal"], ...] = ()
-    """What PDM-Closed and SPDM measure progress along; see spdm plan --progress-reference."""
-    borrow_oncoming: tuple[Literal["no", "yes"], ...] = ()
-    """Whether SPDM may pass a standing obstacle through the oncoming lane (no if left out)."""
-    replan_every: int = 1
-    """Steps of 0.1 s between two plans."""
-    record: Literal["none", "history", "plans"] = "none"
-    """Also write the drives, or the drives and the plan of every step, for the report's player."""
-    types: tuple[str, ...] = ()
-    """Take scenarios of these types only."""
-    by_type: bool = False
-    """Print the scores of each scenario type as well."""
-    seed: int = 0
-    """Seed of the bootstrap intervals."""
-    out: Path = Path("out/simulate")
-    """Run folder to write or to go on with."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,14 @@ from spdm_experiments.inventory import Entry, Shard
 from spdm_experiments.options import Simulate
 from spdm_experiments.report_data import bootstrap, known_means
 from spdm_experiments.report_grid import distinguishing, label
+from spdm_experiments.runtime import configure_jax
 from spdm_experiments.sequence import go_on
-from spdm_experiments.simulate_points import Point, make_points
+from spdm_experiments.simulate_points import (
+    Point,
+    entries_of,
+    learned_planners,
+    make_points,
+)
 from spdm_experiments.simulate_rows import METRICS
 from spdm_experiments.simulate_scenes import Scenes, find_scenes
 from spdm_experiments.simulate_scripts import Extras, ScriptRoom, check_points, room_of
@@ -43,6 +49,8 @@ def run_simulate(options: Simulate) -> bool:
     check_chunk(options)
     if options.replan_every < 1:
         raise ValueError(f"--replan-every is {options.replan_every}; it must be at least 1")
+    if learned_planners(options):
+        configure_jax(options)  # weights are read to the device
     points = make_points(options)
     scenes = find_scenes(options)
     check_points(scenes.extras, points)
@@ -58,7 +66,7 @@ class SimulateRun(GridRun):
         shapes = list(_shapes(options, scenes.inventory.entries, scenes.extras, workers))
         job = SimulateJob(
             folder=options.out,
-            points=[point.entry(number) for number, point in enumerate(points)],
+            points=entries_of(points),
             groups=[group for group, _, _ in shapes],
             precision=options.precision,
             batching=BatchConfig(),

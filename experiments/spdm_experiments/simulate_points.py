@@ -1,13 +1,18 @@
 """Points of `spdm simulate`: a planner, its proposals, the traffic, and how the loop is closed."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 from spdm_experiments.options import Simulate
+from spdm_experiments.simulate_options import LearnedName
 from spdm_experiments.sweep_grid import point_of
 from spdm_jax import PlannerConfig, PlannerParams
+from spdm_models import drivers
+from spdm_models.drivers import LearnedPlanner, Weights
 
 NAMES = {
     "spdm": "SPDM",
@@ -16,11 +21,13 @@ NAMES = {
     "idm-mobil": "IDM + MOBIL",
     "constant-velocity": "Constant velocity",
     "log-replay": "Log replay",
+    **drivers.TITLES,
 }
 """Planners of the command line, and how tables call them."""
 _PROPOSERS = ("spdm", "pdm-closed")
 _SETTINGS: tuple[str, ...] = ("forecast", "progress_reference", "borrow_oncoming")
 """What PDM-Closed and SPDM can be asked for; the other planners have no such thing."""
+_LEARNED: tuple[LearnedName, ...] = get_args(LearnedName)
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,8 @@ class Point:
       mode: "closed" or "open".
       settings: of the planner, as run.json holds them.
       config: static settings of the planner.
-      params: traced settings of the planner.
+      params: traced settings of the planner: numbers, or a learned planner's weights.
+      learned: static settings of a learned planner; None for the others.
     """
 
     planner: str
@@ -43,7 +51,8 @@ class Point:
     mode: str
     settings: Mapping[str, Any]
     config: PlannerConfig
-    params: PlannerParams
+    params: Any
+    learned: LearnedPlanner | None = None
 
     def entry(self, number: int) -> dict[str, Any]:
         """Returns the point as run.json holds it."""
@@ -57,18 +66,31 @@ class Point:
         }
 
 
+def entries_of(points: Sequence[Point]) -> list[dict[str, Any]]:
+    """Returns points as run.json holds them, all with the same entries."""
+    entries = [point.entry(number) for number, point in enumerate(points)]
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    return [{**dict.fromkeys(names), **entry} for entry in entries]
+
+
+def learned_planners(options: Simulate) -> list[LearnedName]:
+    """Returns the planners of the options that need weights."""
+    return [name for name in _LEARNED if name in options.planner]
+
+
 def make_points(options: Simulate) -> list[Point]:
     """Returns the product of planners and kinds of simulation, every point once.
 
     Raises:
-      ValueError: a number of proposals that a planner cannot make, or traffic that reacts to an
-        ego in open loop and no other.
+      ValueError: a number of proposals that a planner cannot make, traffic that reacts to an ego in
+        open loop and no other, or weights that are missing or of another model.
     """
     if options.mode == ("open",) and options.traffic == ("reactive",):
         raise ValueError(
             "--mode open repeats the recorded drive, and its traffic is the recorded one; leave "
             "--traffic out or add --mode closed"
         )
+    _check_learned(options)
     points: dict[str, Point] = {}
     for mode, traffic in product(options.mode, options.traffic or ("reactive",)):
         # In open loop nothing reacts: the point is the same for every kind of traffic.
@@ -79,7 +101,33 @@ def make_points(options: Simulate) -> list[Point]:
     return list(points.values())
 
 
+def _check_learned(options: Simulate) -> None:
+    learned = learned_planners(options)
+    for given, name in ((options.weights, "--weights"), (options.prediction, "--prediction")):
+        if given and not learned:
+            raise ValueError(f"{name} is for learned planners: {', '.join(_LEARNED)}")
+    if learned and options.weights is None:
+        raise ValueError(f"{learned[0]} needs --weights, a file of spdm train or spdm convert")
+    if learned and options.replan_every != 1:
+        raise ValueError(
+            f"{learned[0]} has to see every step of the last 2 s; leave --replan-every out"
+        )
+
+
 def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Iterator[Point]:
+    if planner in _LEARNED:
+        assert options.weights is not None
+        weights = _weights(options.weights, planner)
+        for prediction in options.prediction or ("learned",):
+            settings = {
+                **dict.fromkeys(_SETTINGS),
+                "prediction": prediction,
+                "weights": f"{weights.model} {weights.digest}",
+            }
+            learned = drivers.learned_planner(planner, weights, prediction)
+            config, arrays = PlannerConfig(), weights.arrays
+            yield Point(planner, None, traffic, mode, settings, config, arrays, learned)
+        return
     if planner not in _PROPOSERS:
         none: dict[str, Any] = dict.fromkeys(_SETTINGS)
         yield Point(planner, None, traffic, mode, none, PlannerConfig(), PlannerParams())
@@ -99,3 +147,15 @@ def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Ite
         if planner == "spdm":
             settings["borrow_oncoming"] = "yes" if spec.config.borrow_oncoming else "no"
         yield Point(planner, made.num_proposals, traffic, mode, settings, spec.config, spec.params)
+
+
+def _weights(given: Path, planner: LearnedName) -> Weights:
+    """Reads a planner's weights from the file, or from the folder's file of its name."""
+    path = given / f"{planner}.safetensors" if given.is_dir() else given
+    return _read(path, planner, path.stat().st_mtime_ns if path.is_file() else 0)
+
+
+@cache
+def _read(path: Path, planner: LearnedName, changed: int) -> Weights:
+    """Reads a file once, however many points it drives."""
+    return drivers.read_weights(path, planner)

@@ -5,13 +5,14 @@ from.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from spdm_jax.config import PlannerConfig, PlannerParams
+from spdm_jax.config import PlannerConfig
 from spdm_jax.decision import cast_params
 from spdm_jax.interplan.score import expert_route
 from spdm_jax.metrics import (
@@ -37,9 +38,12 @@ from spdm_jax.simulation.loop import SimulationConfig, SimulationParams, simulat
 from spdm_jax.simulation.mobil_driver import mobil_driver
 from spdm_jax.simulation.script import Script
 from spdm_jax.types import Array, Scenario
+from spdm_models import drivers as learned_drivers
+from spdm_models.drivers import LearnedPlanner
 
 UNREAD = ("map.crosswalks", "map.walkways")
-"""Layers that neither planners nor agents nor metrics read."""
+"""Layers that neither planners nor agents nor metrics read; learned planners see crosswalks."""
+UNREAD_BY_LEARNED = ("map.walkways",)
 SHOWN_SECONDS = np.arange(17) * 0.5
 """Times of a plan's recorded poses, s after its start."""
 
@@ -54,6 +58,7 @@ class Switches:
       simulation: of the loop; its `ego` is "log" in open loop.
       num_iterations: N of every scenario.
       record: also return the run.
+      learned: of a learned planner; None for the others.
     """
 
     planner: str
@@ -61,6 +66,7 @@ class Switches:
     simulation: SimulationConfig
     num_iterations: int
     record: bool = False
+    learned: LearnedPlanner | None = None
 
 
 class Kept(struct.PyTreeNode, kw_only=True):
@@ -102,10 +108,18 @@ class Result(struct.PyTreeNode, kw_only=True):
     kept: Kept | None
 
 
-def make_driver(params: PlannerParams, static: Switches) -> Driver:
-    """Returns a planner by its name on the command line; to be called inside `jit`."""
+def make_driver(shared: Any, static: Switches, dtype: Any) -> Driver:
+    """Returns a planner by its name on the command line; to be called inside `jit`.
+
+    Args:
+      shared: traced settings of PDM-Closed and SPDM, or a learned planner's weights.
+      static: static settings.
+      dtype: of the scene.
+    """
+    if static.learned is not None:
+        return learned_drivers.make_driver(static.learned, shared)
     if static.planner in ("pdm-closed", "spdm"):
-        return planner_driver(static.planner, params, static.config)
+        return planner_driver(static.planner, cast_params(shared, dtype), static.config)
     if static.planner == "idm":
         return idm_driver(max_path_points=static.config.max_path_points)
     if static.planner == "idm-mobil":
@@ -117,18 +131,17 @@ def make_driver(params: PlannerParams, static: Switches) -> Driver:
     raise ValueError(f"no planner {static.planner!r}")
 
 
-def run_scene(
-    scene: Scenario, mine: Script | None, shared: PlannerParams, static: Switches
-) -> Result:
+def run_scene(scene: Scenario, mine: Script | None, shared: Any, static: Switches) -> Result:
     """Simulates one scenario and judges the run.
 
     Args:
       scene: one scenario on the device, of `static.num_iterations` iterations.
       mine: script of an interPlan scenario, else None.
-      shared: traced settings of PDM-Closed and SPDM; the other planners do not read them.
+      shared: traced settings of PDM-Closed and SPDM, or a learned planner's weights; the other
+        planners do not read it.
       static: static settings.
     """
-    driver = make_driver(cast_params(shared, scene.ego.x.dtype), static)
+    driver = make_driver(shared, static, scene.ego.x.dtype)
     run = simulate(scene, driver, SimulationParams(), static.simulation, script=mine)
     expert_lanes = None
     if static.simulation.ego == "log":

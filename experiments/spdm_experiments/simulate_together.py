@@ -6,7 +6,7 @@ from dataclasses import replace
 from spdm_experiments.grid_run import group_of
 from spdm_experiments.inventory import Entry
 from spdm_experiments.options import Simulate
-from spdm_experiments.simulate_points import Point
+from spdm_experiments.simulate_points import Point, entries_of
 from spdm_experiments.simulate_work import SimulateJob
 from spdm_jax.batching import BatchConfig
 from spdm_jax.padding import PaddingConfig, bucket
@@ -40,7 +40,7 @@ def together(options: Simulate, entries: Sequence[Entry], points: Sequence[Point
     )
     return SimulateJob(
         folder=options.out,
-        points=[point.entry(number) for number, point in enumerate(points)],
+        points=entries_of(points),
         groups=[group],
         precision=options.precision,
         batching=BatchConfig(),

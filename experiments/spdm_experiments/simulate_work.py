@@ -11,7 +11,13 @@ from spdm_experiments.loading import LoadedScenes
 from spdm_experiments.rows import Layout
 from spdm_experiments.simulate_points import Point
 from spdm_experiments.simulate_rows import histories_of, layout_of, result_rows
-from spdm_experiments.simulate_scene import UNREAD, Result, Switches, run_scene
+from spdm_experiments.simulate_scene import (
+    UNREAD,
+    UNREAD_BY_LEARNED,
+    Result,
+    Switches,
+    run_scene,
+)
 from spdm_experiments.simulate_scripts import Extras, ScriptRoom, scripts_of, verdicts_of
 from spdm_experiments.work import Arrays, Engine, Group, Job
 from spdm_jax.padding import bucket
@@ -28,6 +34,8 @@ PATH_REST = 96
 """Points that may still lie ahead of an agent when the next lane is appended: some 60 m."""
 AMPLE_LIGHTS, AMPLE_LIGHT_EDGES, AMPLE_OUTLINE = 64, 8192, 8
 """Red lights, their edges, and blocks of an outline, for scenarios that need more than usual."""
+AMPLE_LINES = 32
+"""Lanes that a learned planner may follow, for the same."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ class SimulateJob(Job):
 
     def unread(self) -> Sequence[str]:
         """Returns the layers that nobody reads."""
-        return UNREAD
+        return UNREAD_BY_LEARNED if any(point.learned for point in self.runs) else UNREAD
 
     def engine(self) -> "SimulateEngine":
         """Returns what computes the chunks."""
@@ -153,8 +161,11 @@ def switches_of(point: Point, group: Group, job: SimulateJob, *, ample: bool = F
     config = replace(point.config, max_path_points=group.max_path_points)
     if ample:
         config = replace(config, max_red_lights=AMPLE_LIGHTS, max_red_edges=AMPLE_LIGHT_EDGES)
-    record = job.arrays is not None
-    return Switches(point.planner, config, simulation, group.num_iterations, record)
+    record, learned = job.arrays is not None, point.learned
+    if learned is not None:
+        lines = AMPLE_LINES if ample else learned.num_lines
+        learned = replace(learned, max_path_points=group.max_path_points, num_lines=lines)
+    return Switches(point.planner, config, simulation, group.num_iterations, record, learned)
 
 
 def _join(kept: Sequence[Arrays]) -> Arrays:

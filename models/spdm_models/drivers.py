@@ -64,6 +64,7 @@ class LearnedPlanner:
       prediction: what it takes for the neighbours' futures.
       code: digest of this package: stored programs are found by it.
       max_path_points: room for the map's points along a line.
+      num_lines: room for lanes that may be followed.
     """
 
     name: LearnedName
@@ -72,6 +73,7 @@ class LearnedPlanner:
     prediction: Prediction
     code: str
     max_path_points: int = 2048
+    num_lines: int = 8
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,17 @@ class Weights:
     arrays: dict[str, Any]
     digest: str
     training: Mapping[str, Any]
+
+    @property
+    def sizes(self) -> str:
+        """The network's sizes, for people."""
+        network = self.network
+        if isinstance(network, DIPPConfig):
+            return f"width {network.width}, {network.modes} modes, {network.horizon} steps"
+        encoder = f"width {network.encoder.width}, {network.encoder.layers} encoder layers"
+        if isinstance(network, DTPPConfig):
+            return encoder
+        return f"{encoder}, N_l = {network.levels}, {network.modes} modes"
 
 
 def read_weights(path: Path, name: LearnedName) -> Weights:
@@ -144,7 +157,7 @@ def make_driver(planner: LearnedPlanner, arrays: Mapping[str, Any]) -> Driver:
     params: Params = arrays["network"]
     network, room = planner.network, planner.max_path_points
     if isinstance(network, DTPPConfig):
-        lines = RouteLineConfig(max_path_points=room)
+        lines = RouteLineConfig(num_lines=planner.num_lines, max_path_points=room)
         config = DTPPDriverConfig(
             planner=DTPPPlannerConfig(network=network, lines=lines), prediction=planner.prediction
         )
@@ -165,7 +178,7 @@ def make_driver(planner: LearnedPlanner, arrays: Mapping[str, Any]) -> Driver:
         dipp=replace(
             default, problem=_problem(network.steps, default.problem), max_path_points=room
         ),
-        lines=RouteLineConfig(min_length=24.0, max_path_points=room),
+        lines=RouteLineConfig(num_lines=planner.num_lines, min_length=24.0, max_path_points=room),
     )
     title = TITLES[planner.name]
     return gameformer_driver(title, params, arrays["cost_weights"], config)

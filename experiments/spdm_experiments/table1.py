@@ -1,0 +1,166 @@
+"""`python -m spdm_experiments.table1`: planners beside learned, perfect and no predictions.
+
+`run` drives PDM-Closed, DTPP, GameFormer, GameFormer + DIPP and DIPP through the built-in suites,
+as `spdm simulate` does, and prints their scores beside the paper's; `page` only writes the page.
+Each column has a run folder below --out: the same command goes on where it was stopped.
+"""
+
+import argparse
+import io
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from spdm_experiments.closed_loop import (
+    ABOUT,
+    EXIT_ERROR,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    drive,
+    note_machine,
+)
+from spdm_experiments.options import Simulate
+from spdm_experiments.report_data import load_run
+from spdm_experiments.runtime import configure_jax
+from spdm_experiments.table1_data import cells_of, frame_of
+from spdm_experiments.table1_lineup import COLUMNS, PLANNERS, Planner, learned, suite_of
+from spdm_experiments.table1_page import score_table, write_page
+from spdm_jax.io.scenario_file import write_atomically
+
+WEIGHTS, TABLE = "weights.json", "table1.parquet"
+CHUNK = 4
+"""Scenarios of a chunk: each is driven by every planner, and a chunk is what a stop can cost."""
+
+
+def main(argv: Sequence[str] | None = None, scenes: Path | None = None) -> int:
+    """Runs the command and returns the exit code.
+
+    Args:
+      argv: arguments without the program's name; those of the process by default.
+      scenes: scenarios to drive through instead of the built-in suites.
+    """
+    given = _options(argv)
+    options = Simulate(scenes=Path(), out=given.out, chunk=given.chunk, device=given.device)
+    try:
+        good = True
+        if given.step == "run":
+            configure_jax(options)
+            _check_weights(given.weights, given.planner)
+            # All files are read before the first drive.
+            _note_weights(given.out, given.weights, given.planner)
+            note_machine(given.out, _command(given))
+            for column in (column for column in COLUMNS if column.key in given.column):
+                suite = suite_of(column, given.planner, given.weights, scenes)
+                good &= drive(suite, replace(options, out=given.out / suite.name), given.limit)
+        for path in _write(given.page, given.out):
+            print(f"written: {path}")
+        return 0 if good else EXIT_FAILED
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except (ValueError, OSError, ImportError) as error:
+        print(f"table1: {error}", file=sys.stderr)
+        return EXIT_ERROR
+
+
+def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m spdm_experiments.table1",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("step", nargs="?", choices=("run", "page"), default="run", help="what to do")
+    add("--weights", type=Path, help="folder with PLANNER.safetensors of each learned planner")
+    add("--out", type=Path, default=Path("out/table1"), help="run folders and table1.parquet")
+    add("--planner", choices=PLANNERS, nargs="+", default=PLANNERS, help="these rows only")
+    keys = tuple(column.key for column in COLUMNS)
+    add("--column", choices=keys, nargs="+", default=keys, help="these columns only")
+    add("--page", type=Path, help="Markdown page to write, with a figure beside it")
+    add("--limit", type=int, help="take so many scenarios of each type only")
+    add("--chunk", type=int, default=CHUNK, help="scenarios between two stops")
+    add("--device", choices=("auto", "cpu", "gpu"), default="auto")
+    options = parser.parse_args(argv)
+    for name in ("limit", "chunk"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            parser.error(f"--{name} is {value}; it must be at least 1")
+    if options.page and options.page.suffix != ".md":
+        parser.error(f"--page {options.page} must end in .md")
+    if options.step == "page" and not options.page:
+        parser.error("page needs --page, the Markdown file to write")
+    return options
+
+
+def _command(given: argparse.Namespace) -> str:
+    parts = ["python -m spdm_experiments.table1 run"]
+    if given.weights:
+        parts.append(f"--weights {given.weights}")
+    if tuple(given.planner) != PLANNERS:
+        parts.append(f"--planner {' '.join(given.planner)}")
+    if len(given.column) < len(COLUMNS):
+        parts.append(f"--column {' '.join(given.column)}")
+    if given.limit is not None:
+        parts.append(f"--limit {given.limit}")
+    return " ".join(parts)
+
+
+def _check_weights(weights: Path | None, planners: Sequence[Planner]) -> None:
+    names = learned(planners)
+    if names and weights is None:
+        raise ValueError(f"--weights is missing: a folder with {names[0]}.safetensors, ...")
+    if names and weights is not None and not weights.is_dir():
+        raise ValueError(f"--weights {weights}: no such folder; it holds PLANNER.safetensors files")
+
+
+def _note_weights(out: Path, folder: Path | None, planners: Sequence[Planner]) -> None:
+    """Keeps what the headers of the weights say.
+
+    Raises:
+      ValueError: a file is missing, damaged, or of another model.
+    """
+    from spdm_models.drivers import read_weights
+
+    facts: dict[str, Any] = {}
+    for name in learned(planners):
+        assert folder is not None
+        weights = read_weights(folder / f"{name}.safetensors", name)
+        facts[name] = {
+            "file": weights.path.name,
+            "digest": weights.digest,
+            "model": weights.model,
+            "sizes": weights.sizes,
+            "training": dict(weights.training),
+        }
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / WEIGHTS, (json.dumps(facts, indent=1) + "\n").encode())
+
+
+def _write(page: Path | None, out: Path) -> list[Path]:
+    """Writes table and page of the runs that are there, and prints the table.
+
+    Raises:
+      ValueError: there is none.
+    """
+    folders = [out / column.folder for column in COLUMNS]
+    there = [folder for folder in folders if any(folder.glob("rows/*.parquet"))]
+    if not there or not (out / ABOUT).is_file():
+        raise ValueError(f"{out}: no rows yet; run first: python -m spdm_experiments.table1 run")
+    runs = [load_run(folder) for folder in there]
+    cells = cells_of(runs)
+    print(score_table(cells))
+    buffer = io.BytesIO()
+    frame_of(cells).write_parquet(buffer)
+    write_atomically(out / TABLE, buffer.getvalue())
+    written = [out / TABLE]
+    if page is not None:
+        read = lambda name: json.loads((out / name).read_text(encoding="utf-8"))
+        written += write_page(page, cells, runs, {**read(ABOUT), "weights": read(WEIGHTS)})
+    return written
+
+
+if __name__ == "__main__":
+    sys.exit(main())
