@@ -5,12 +5,14 @@ import subprocess
 from pathlib import Path
 from xml.etree import ElementTree
 
+import jax
 import numpy as np
 import pytest
 
 from spdm_experiments import (
     bench,
     bench_drives,
+    bench_learned,
     bench_page,
     bench_process,
     bench_rows,
@@ -146,6 +148,29 @@ def test_page_without_drives_has_no_section_of_them(tmp_path: Path):
     rows = [row for row in made_up_rows() if "drives" not in row]
     bench_page.write_page(tmp_path / "page.md", ABOUT, rows, {})
     assert "## Closed loop" not in (tmp_path / "page.md").read_text(encoding="utf-8")
+
+
+def test_page_shows_learned_planners_beside_torch(tmp_path: Path):
+    rows = made_up_rows()
+    bench_page.write_page(tmp_path / "page.md", ABOUT, rows, {})
+    assert "## Learned" not in (tmp_path / "page.md").read_text(encoding="utf-8")
+    rows += [
+        row("GameFormer forward, batch 32", 2000.0, network="GameFormer", batch=32),
+        row("DTPP, one drive", 9000.0, planner="DTPP", seconds=14.9, suite="common-14"),
+    ]
+    bench_page.write_page(tmp_path / "page.md", ABOUT, rows, {})
+    text = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert "| GameFormer | 32 | 2000.0 / 1000.0 | 100.0 | 174 |" in text
+    assert "| DTPP | 9.0 | 2 |" in text
+
+
+@pytest.mark.slow
+def test_networks_of_the_benchmark_run():
+    for network in bench_learned.networks(16).values():
+        params = network.init(jax.random.key(0))
+        output = jax.jit(network.forward)(params, network.inputs(2))
+        for leaf in jax.tree.leaves(output):
+            assert np.isfinite(leaf).all()
 
 
 def test_page_keeps_what_people_wrote(tmp_path: Path):

@@ -122,6 +122,20 @@ def test_every_cell_of_the_paper_is_driven(column: Column, weights: Path):
     assert sorted(rows) == sorted(wanted)
 
 
+def test_columns_have_names_of_their_own():
+    names = [column.folder for column in COLUMNS]
+    assert names == [
+        "common-14-non-reactive",
+        "common-14-reactive",
+        "common-14-open-loop",
+        "interactive-8-reactive",
+    ]
+    assert [column.title for column in COLUMNS][2:] == [
+        "common-14, open loop",
+        "interactive-8, reactive",
+    ]
+
+
 def test_published_scores_are_those_of_the_paper():
     assert published("dtpp", "perfect", BY_KEY["ol"]) == 32.52
     assert published("pdm-closed", "perfect", BY_KEY["r"]) is None

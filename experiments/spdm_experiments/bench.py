@@ -26,7 +26,17 @@ VERSIONED = ("spdm-jax", "jax", "jaxlib", "numpy")
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda"}
 FIRST_CALLS = 3
 """First calls of each planner with an empty compile cache (and as many with a full one)."""
-KINDS = ("steps", "fans", "batches", "drives", "first call", "first drive", "memory", "sweep")
+KINDS = (
+    "steps",
+    "fans",
+    "batches",
+    "drives",
+    "learned",
+    "first call",
+    "first drive",
+    "memory",
+    "sweep",
+)
 """What the names of units begin with."""
 
 
@@ -85,11 +95,13 @@ class Results:
 
 def _digest() -> str:
     """Digest of the code that is measured, and of the code that measures."""
+    import spdm_models
     from spdm_jax.programs import package_digest
 
     digest = hashlib.sha256(package_digest().encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for folder in (Path(__file__).parent, Path(str(spdm_models.__file__)).parent):
+        for path in sorted(folder.glob("*.py")):
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -178,6 +190,8 @@ def measure_all(results: Results, out: Path, scale: str) -> None:
             results.unit(name, lambda g=group: _child(g, cores, precision, scale, scenes))
 
     children(cores, "f32", scale)
+    name = f"learned, f32, {cores} core(s)"
+    results.unit(name, lambda: _child("learned", cores, "f32", scale, scenes))
     # A first call compiles anew: too slow for a toy run.
     planners = (("PDM-Closed", 15), ("SPDM", 60)) if full else ()
     memories = (("trajectories", 4096), ("scenes", 16), ("scenes", 64), ("scenes", 256))

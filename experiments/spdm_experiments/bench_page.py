@@ -32,6 +32,13 @@ QUOTED = {
 }
 """The published reference on one thread of this class of machine, when the yardstick took 29 ms:
 quoted, not measured here."""
+TORCH_YARDSTICKS = {
+    "GameFormer": {1: 12, 32: 174},
+    "DTPP": {1: 9, 32: 316},
+    "DIPP": {1: 13, 32: 258},
+}
+"""Network -> scenes -> a forward pass of the public torch code on two cores, in yardsticks: quoted,
+not measured here."""
 DRIVE_S, DRIVE_COLD_S, DRIVE_WARM_S = 1.0, 30.0, 2.0
 """What a drive is to take per scenario, and the first one with an empty and a filled cache."""
 SWEEP_RATIO, COLD_S, WARM_S, PEAK_MB, FLAT = 1.5, 6.0, 0.5, 1000.0, 1.1
@@ -70,6 +77,7 @@ def write_page(page: Path, about: Row, rows: Sequence[Row], apart: Mapping[str, 
         _about(about, main),
         _marks(main, apart),
         _drives(main, apart),
+        _learned(main),
         "## Other precision, other cores\n\nMedian / minimum, ms.\n",
         _columns(rows),
         "## Cost over trajectories and over scenes\n",
@@ -211,6 +219,35 @@ def _drives(rows: Sequence[Row], apart: Mapping[str, Row]) -> str:
         )
     head = ["traffic", "scenarios", "to reach", "per scenario", "yardsticks", "reached"]
     return f"## Closed loop\n\n{text}{markdown_table(head, body)}"
+
+
+def _learned(rows: Sequence[Row]) -> str:
+    """The section on learned planners; empty where none were measured."""
+    passes = [row for row in rows if "network" in row]
+    if not passes:
+        return ""
+    body = []
+    for row in passes:
+        sticks = f"{row['median_ms'] / row['yardstick_ms']:.1f}"
+        quoted = TORCH_YARDSTICKS[row["network"]].get(row["batch"], "")
+        ms = f"{row['median_ms']:.1f} / {row['min_ms']:.1f}"
+        body.append([row["network"], str(row["batch"]), ms, sticks, str(quoted)])
+    head = ["forward pass", "scenes", "median / min, ms", "yardsticks", "torch, yardsticks"]
+    text = (
+        "Networks of the published sizes with random weights; what the public torch code takes on "
+        "two cores is quoted.\n\n" + markdown_table(head, body)
+    )
+    if drives := [row for row in rows if row["workload"].endswith(", one drive")]:
+        lines = [
+            [row["planner"], f"{1e-3 * row['median_ms']:.1f}", f"{row['first_call_s']:.0f}"]
+            for row in drives
+        ]
+        text += (
+            f"\nOne scenario of {drives[0]['suite']}, {drives[0]['seconds']:g} s, non-reactive, as "
+            "`spdm simulate` drives it, own predictions.\n\n"
+            + markdown_table(["planner", "drive, s", "first one, compilation included, s"], lines)
+        )
+    return f"## Learned planners\n\n{text}"
 
 
 def _columns(rows: Sequence[Row]) -> str:

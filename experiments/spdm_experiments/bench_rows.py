@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from spdm_experiments.bench_drives import drives
+from spdm_experiments.bench_learned import learned
 from spdm_experiments.bench_scenes import check_counts, scene_files
 from spdm_experiments.bench_stages import stages
 from spdm_experiments.bench_watch import Stopwatch
@@ -58,6 +59,9 @@ class Size:
       mixed: number of built-in scenes planned in one call.
       drives: numbers of scenarios driven through in one call, in closed loop.
       stages: whether to time the stages of each step.
+      network_width: of the learned networks' tokens.
+      network_batches: scenes in one forward pass of theirs.
+      learned_drives: whether learned planners drive a scenario each.
     """
 
     repetitions: int
@@ -67,6 +71,9 @@ class Size:
     mixed: int
     drives: tuple[int, ...]
     stages: bool = True
+    network_width: int = 256
+    network_batches: tuple[int, ...] = (1, 32)
+    learned_drives: bool = True
 
 
 SIZES = {
@@ -79,9 +86,19 @@ SIZES = {
         (1, 8, 16, 32),
     ),
     "half": Size(15, (("PDM-Closed", 15), ("SPDM", 60)), (4096,), (64,), 64, (8,), stages=False),
-    "quick": Size(3, (("PDM-Closed", 15),), (64,), (2,), 2, (1,)),
+    "quick": Size(
+        3,
+        (("PDM-Closed", 15),),
+        (64,),
+        (2,),
+        2,
+        (1,),
+        network_width=16,
+        network_batches=(1, 2),
+        learned_drives=False,
+    ),
 }
-GROUPS = ("steps", "fans", "batches", "drives")
+GROUPS = ("steps", "fans", "batches", "drives", "learned")
 """What one child measures."""
 
 
@@ -120,6 +137,7 @@ def measure(group: str, size: Size, precision: Precision, folder: Path) -> list[
         "fans": child.fans,
         "batches": child.batches,
         "drives": lambda: drives(child),
+        "learned": lambda: learned(child),
     }[group]()
     device = jax.devices()[0]
     about = {

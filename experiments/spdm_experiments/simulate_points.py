@@ -151,7 +151,8 @@ def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Ite
 
 def _weights(given: Path, planner: LearnedName) -> Weights:
     """Reads a planner's weights from the file, or from the folder's file of its name."""
-    path = given / f"{planner}.safetensors" if given.is_dir() else given
+    name = "gameformer" if planner == "gameformer-path" else planner
+    path = given / f"{name}.safetensors" if given.is_dir() else given
     return _read(path, planner, path.stat().st_mtime_ns if path.is_file() else 0)
 
 

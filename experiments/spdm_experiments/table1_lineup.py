@@ -58,12 +58,10 @@ class Column:
 
 
 COLUMNS: Final = (
-    Column("nr", "common-14", "replay", "closed", "common-14, non-reactive", "Val14 NR"),
-    Column("r", "common-14", "reactive", "closed", "common-14, reactive", "Val14 R"),
-    Column("ol", "common-14", "replay", "open", "common-14, open loop", "Val14 OL"),
-    Column(
-        "interplan", "interactive-8", "reactive", "closed", "interactive-8, reactive", "interPlan R"
-    ),
+    Column("nr", "common-14", "replay", "closed", "non-reactive", "Val14 NR"),
+    Column("r", "common-14", "reactive", "closed", "reactive", "Val14 R"),
+    Column("ol", "common-14", "replay", "open", "open loop", "Val14 OL"),
+    Column("interplan", "interactive-8", "reactive", "closed", "reactive", "interPlan R"),
 )
 _PUBLISHED: Final[Mapping[Planner, Sequence[Sequence[float | None]]]] = {
     "pdm-closed": (

@@ -185,7 +185,7 @@ def plot_pairs(cells: Sequence[Cell]) -> Figure:
         axis.set_title(column.title, pad=3)
         axis.set_xlabel("Perfect predictions")
         axis.set(xlim=(0, 100), ylim=(0, 100), aspect="equal")
-        axis.grid(axis="both")
+        axis.grid(True, axis="both")
     axes[0].set_ylabel("Learned predictions")
     draw = lambda axis, **look: axis.plot([], [], ls="none", **look)[0]
     kinds = [draw(axes[0], marker="o", color=colors[name]) for name in planners]
