@@ -51,6 +51,10 @@ def run_train(options: Train) -> bool:
     from spdm_models.train_tasks import make_task
     from spdm_models.weights import save_weights
 
+    for name in ("steps", "batch", "every"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ValueError(f"--{name} is {value}; it must be at least 1")
     task = make_task(options.model, options.size, options.modes)
     inventory = find_scenes(options)
     began = time.perf_counter()
@@ -88,6 +92,7 @@ def run_train(options: Train) -> bool:
     }
     for line in describe(options.out / RUN, {**about, **facts}, COMPARED, NOTED):
         print(f"note: {line}", file=sys.stderr)
+    started = json.loads((options.out / RUN).read_text(encoding="utf-8"))
     # As JSON has it: tuples become lists.
     about = json.loads(json.dumps(about))
     line = _StepLine(config.steps, per_epoch)
@@ -112,7 +117,8 @@ def run_train(options: Train) -> bool:
         "size": options.size,
         "steps": config.steps,
         "seed": options.seed,
-        **facts,
+        # Of the first start: the same weights have the same header, whoever went on with them.
+        **{name: value for name, value in started.items() if name in facts},
         "validation": _last(fitted.log),
         **task.learnt(fitted.params),
     }
