@@ -407,6 +407,20 @@ def to_navsim(
     return made[precision]
 
 
+def scenarios_only(scenes: ScenarioSet | NavsimSet) -> ScenarioSet:
+    """Returns scenarios.
+
+    Raises:
+      ValueError: they are NAVSIM's frames, which the "tuplan" profile cannot score.
+    """
+    if isinstance(scenes, NavsimSet):
+        raise ValueError(
+            "profile is 'tuplan', but the scenes are NAVSIM's frames; pass profile='navsim1' or "
+            "'navsim2', or scenarios"
+        )
+    return scenes
+
+
 def refuse_foreign(**options: Any) -> None:
     """Refuses options that NAVSIM's profiles would silently ignore.
 
@@ -534,11 +548,7 @@ def score(
         )
     if previous is not None:
         raise ValueError("previous is for profile='navsim2'; the tuplan score does not look at it")
-    if isinstance(scenes, NavsimSet):
-        raise ValueError(
-            "profile is 'tuplan', but the scenes are NAVSIM's frames; pass profile='navsim1' or "
-            "'navsim2', or scenarios"
-        )
+    scenes = scenarios_only(scenes)
     dt = 0.1 if dt is None else dt
     config = config or PlannerConfig()
     if tracker not in ("reference", "corrected", "none"):

@@ -5,7 +5,7 @@ import numpy as np
 from flax import struct
 
 from spdm_jax.batching import BatchConfig, Precision, SceneRunner
-from spdm_jax.config import ScoringParams
+from spdm_jax.config import DT, ScoringParams
 from spdm_jax.navsim.frames import NavsimSet
 from spdm_jax.navsim.results import NavsimScoreSet
 from spdm_jax.navsim.score import score_states, score_trajectories
@@ -101,7 +101,7 @@ def score_frames(
     """
     frames.require(profile)
     values = as_array(trajectories)
-    step = dt if dt is not None else POSE_DT if values.shape[-2:] == (NUM_POSES, 3) else 0.1
+    step = pose_interval(values.shape, dt)
     values = check_trajectories(values, step, len(frames))
     given = _as_given(values, frames, step, frame)
     blocks, parts = _blocks(given, *_previous(previous, given.shape[:2]))
@@ -121,9 +121,23 @@ def _as_given(values: np.ndarray, frames: NavsimSet, dt: float, frame: Frame) ->
     values = to_ego(values, frame, pose, origin)
     if values.shape[-1] == len(STATE_COLUMNS):
         return to_local(resample(values, dt), "ego", pose, origin)
+    return navsim_poses(values, dt)
+
+
+def navsim_poses(values: np.ndarray, dt: float) -> np.ndarray:
+    """Returns what NAVSIM sees of poses `[B, P, T, 3]`, ego frame: `[B, P, 8, 3]`.
+
+    Raises:
+      ValueError: they do not cover 4 s.
+    """
     if values.shape[2] == NUM_POSES and np.isclose(dt, POSE_DT):
         return values
     return resample(values, dt)[:, :, STEPS_PER_POSE::STEPS_PER_POSE]
+
+
+def pose_interval(shape: tuple[int, ...], given: float | None) -> float:
+    """Returns the interval of trajectories of a shape, s: NAVSIM's for its own eight poses."""
+    return given if given is not None else POSE_DT if shape[-2:] == (NUM_POSES, 3) else DT
 
 
 def _previous(previous, count: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -76,6 +76,14 @@ class NavsimSet:
         """Returns some of the frames, in the order of `rows`, without the failures."""
         return NavsimSet([self.frames[i] for i in rows], [self.infos[i] for i in rows])
 
+    def serving(self, profile: Profile) -> NavsimSet:
+        """Returns the frames that have everything for a profile; the others join the failures."""
+        good = [profile.name in info.profiles for info in self.infos]
+        found = self.select(np.flatnonzero(good).tolist())
+        lacking = [Failure(i.token, lack(i, profile)) for i in self.infos if i not in found.infos]
+        found.failures += [*self.failures, *lacking]
+        return found
+
     def require(self, profile: Profile) -> None:
         """Refuses a profile that a frame lacks something for.
 
@@ -84,18 +92,20 @@ class NavsimSet:
         """
         for info in self.infos:
             if profile.name not in info.profiles:
-                raise ValueError(f"frame {info.token}: {_advice(info, profile)}")
+                raise ValueError(f"frame {info.token}: {lack(info, profile)}")
 
 
-def _advice(info: NavsimInfo, profile: Profile) -> str:
-    able = " and ".join(info.profiles)
+def lack(info: NavsimInfo, profile: Profile) -> str:
+    """Says why a frame does not serve a profile, and what to do."""
+    able = " and ".join(info.profiles) or "no profile"
     if info.source.startswith("NAVSIM"):
         version = "v1.1" if profile.name in FIRST else "v2.2"
         return (
             f"exported with {info.source}, whose metric cache serves {able}, not {profile.name}; "
             f"export the metric cache of NAVSIM {version}"
         )
+    needs = "5 s after" if profile.name in FIRST else "1.5 s before and 4 s after"
     return (
-        f"has less than 1.5 s of recorded past, which {profile.name} needs; it serves {able}. "
-        "Take scenarios with more history"
+        f"serves {able}, not {profile.name}, which needs a record of {needs} iteration 0. Leave "
+        "the scenario out, or pack it with more"
     )

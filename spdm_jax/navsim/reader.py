@@ -43,9 +43,7 @@ def read_frame(path: str | Path) -> tuple[NavsimScene, NavsimInfo]:
     """
     path = Path(path)
     arrays = _arrays(path)
-    devkit = str(arrays["devkit"])
-    if devkit not in _FRAMES:
-        raise ScenarioError(f"{path}: devkit is {devkit!r}; expected v1 or v2. Export it again")
+    info, devkit = _info(path, arrays), str(arrays["devkit"])
     if missing := [name for name in _NEEDED[devkit] if name not in arrays]:
         raise ScenarioError(f"{path}: {missing[0]} is missing; export this frame again")
     try:
@@ -55,13 +53,29 @@ def read_frame(path: str | Path) -> tuple[NavsimScene, NavsimInfo]:
     except ValueError as error:
         text = str(error)
         raise ScenarioError(text if text.startswith(str(path)) else f"{path}: {text}") from error
-    info = NavsimInfo(
+    return frame, info
+
+
+def describe_export(path: Path) -> NavsimInfo:
+    """Reads what an exported frame says of itself.
+
+    Raises:
+      ScenarioError: the file is damaged or of another layout.
+      OSError: the file cannot be opened.
+    """
+    return _info(path, _arrays(path, ("devkit", "token", "log_name")))
+
+
+def _info(path: Path, arrays: dict[str, np.ndarray]) -> NavsimInfo:
+    devkit = str(arrays["devkit"])
+    if devkit not in _FRAMES:
+        raise ScenarioError(f"{path}: devkit is {devkit!r}; expected v1 or v2. Export it again")
+    return NavsimInfo(
         token=str(arrays["token"]),
         log_name=str(arrays["log_name"]),
         source=f"NAVSIM {devkit}",
         profiles=FIRST if devkit == "v1" else SECOND,
     )
-    return frame, info
 
 
 def _open(path: Path) -> Any:
@@ -69,8 +83,8 @@ def _open(path: Path) -> Any:
     return np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Reads all arrays after a check of format and version."""
+def _arrays(path: Path, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    """Reads arrays, all if None, after a check of format and version."""
     try:
         with _open(path) as stored:
             if "format" not in stored.files:
@@ -84,7 +98,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                     f"{path}: format is {found[0]!r}, version {found[1]!r}; this library reads "
                     f"{FORMAT!r}, version {VERSION}. Export with the script that comes with it"
                 )
-            return {name: stored[name] for name in stored.files}
+            return {name: stored[name] for name in names or stored.files}
     except ScenarioError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, *DAMAGE) as error:

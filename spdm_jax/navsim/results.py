@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from spdm_jax.config import DT
 from spdm_jax.navsim.frames import NavsimInfo
-from spdm_jax.navsim.types import NavsimScores, Terms
+from spdm_jax.navsim.types import NavsimScores
 from spdm_jax.results import COMFORT_NAMES, Explanation, Failure
 from spdm_jax.scoring.profile import Profile, Term
 
 if TYPE_CHECKING:
     import polars
 
-TERMS = tuple(Terms.__dataclass_fields__)
+TERMS: tuple[Term, ...] = get_args(Term)
 COMPONENTS = ("total", *TERMS, "progress_raw", "total_without_extended_comfort", "total_unfiltered")
 """One number per trajectory: the score, its terms as they entered it, and other readings of it."""
 

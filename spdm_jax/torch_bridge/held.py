@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import numpy as np
@@ -13,6 +13,8 @@ import numpy as np
 from spdm_jax.api import fit_config
 from spdm_jax.batching import Precision, cast_leaf, leaf_type, x64
 from spdm_jax.config import PlannerConfig, PlannerParams
+from spdm_jax.navsim.frames import NavsimSet
+from spdm_jax.navsim.types import NavsimScene
 from spdm_jax.programs import Program
 from spdm_jax.results import ScenarioSet
 from spdm_jax.types import Scenario
@@ -20,6 +22,7 @@ from spdm_jax.types import Scenario
 if TYPE_CHECKING:
     from torch import Tensor  # pyright: ignore[reportMissingImports]
 
+Scene: TypeAlias = Scenario | NavsimScene
 PROBLEMS = {
     1: "more path points or red lights than there is room for; raise "
     "PlannerConfig.max_red_lights or max_red_edges",
@@ -32,22 +35,24 @@ class UnusableScene(ValueError):
 
 
 class Held:
-    """The scenarios of a set on one device, in one precision; filled as they are asked for."""
+    """The scenes of a set on one device, in one precision; filled as they are asked for."""
 
-    def __init__(self, scenes: ScenarioSet, precision: Precision, device: Any):
+    def __init__(self, scenes: ScenarioSet | NavsimSet, precision: Precision, device: Any):
         self.device = device
         self.precision: Precision = precision
         self.dtype = np.dtype(np.float64 if precision == "f64" else np.float32)
         self.tokens = [info.token for info in scenes.infos]
         self._row = {token: i for i, token in enumerate(self.tokens)}
         self._failed = {failure.token: failure.reason for failure in scenes.failures}
-        self._batch = scenes.batch
-        self._scenes: dict[int, Scenario] = {}
-        self._stacked: Scenario | None = None
+        self._batch = scenes.stacked() if isinstance(scenes, NavsimSet) else scenes.batch
+        self._scenes: dict[int, Scene] = {}
+        self._stacked: Scene | None = None
         self._params: PlannerParams | None = None
         self._pools: dict[int, ThreadPoolExecutor] = {}
         self._lock = threading.RLock()
-        self.path_room = fit_config(scenes, PlannerConfig()).max_path_points
+        self.path_room: int | None = None  # frames hold their path
+        if isinstance(scenes, ScenarioSet):
+            self.path_room = fit_config(scenes, PlannerConfig()).max_path_points
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -103,14 +108,14 @@ class Held:
             self._params = moved
         return moved
 
-    def shape(self, count: int | None = None) -> Scenario:
+    def shape(self, count: int | None = None) -> Scene:
         """Returns the shape of one scenario, or of `count` stacked ones."""
         lead = () if count is None else (count,)
         kind = lambda leaf: leaf_type(leaf, self.dtype)
         like = lambda leaf: jax.ShapeDtypeStruct((*lead, *leaf.shape[1:]), kind(leaf))
         return jax.tree.map(like, self._batch)
 
-    def scene(self, row: int, made: Program) -> Scenario:
+    def scene(self, row: int, made: Program) -> Scene:
         """Returns one scenario on the device."""
         if (found := self._scenes.get(row)) is None:
             with self._lock:
@@ -118,7 +123,7 @@ class Held:
                     found = self._scenes[row] = self._place(made, lambda leaf: leaf[row])
         return found
 
-    def stacked(self, made: Program) -> Scenario:
+    def stacked(self, made: Program) -> Scene:
         """Returns all scenarios on the device."""
         with self._lock:
             if self._stacked is None:
@@ -132,7 +137,7 @@ class Held:
                 self._pools[threads] = ThreadPoolExecutor(threads, "spdm-torch")
             return self._pools[threads]
 
-    def _place(self, made: Program, pick: Any) -> Scenario:
+    def _place(self, made: Program, pick: Any) -> Scene:
         leaves, tree = jax.tree.flatten(self._batch)
         used = made.used[: len(leaves)]
         cast = [cast_leaf(pick(v), u, self.dtype) for v, u in zip(leaves, used, strict=True)]
@@ -150,7 +155,7 @@ class _Cache(dict[Any, Held]):
         return (_Cache, ())
 
 
-def held_scenes(scenes: ScenarioSet, precision: Precision, device: Any) -> Held:
+def held_scenes(scenes: ScenarioSet | NavsimSet, precision: Precision, device: Any) -> Held:
     """Returns what a set keeps on a device, made at the first call."""
     cache = vars(scenes).setdefault("_on_devices", _Cache())
     key = (precision, device)

@@ -10,12 +10,23 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import jax
 import numpy as np
 
+from spdm_jax.api import refuse_foreign, scenarios_only, to_navsim
 from spdm_jax.batching import Precision, usable_cores, x64
 from spdm_jax.config import DT, PlannerConfig, PlannerParams, Tracker
+from spdm_jax.navsim.evaluate import pose_interval
+from spdm_jax.navsim.frames import NavsimSet
 from spdm_jax.programs import Program, program
 from spdm_jax.results import ScenarioSet
+from spdm_jax.scoring.profile import TUPLAN, Profile, profile_named
 from spdm_jax.torch_bridge.held import UnusableScene, held_scenes
-from spdm_jax.torch_bridge.task import COMPONENTS, Task, score_batch, score_rows
+from spdm_jax.torch_bridge.task import (
+    AnyTask,
+    NavsimTask,
+    Task,
+    components_of,
+    score_batch,
+    score_rows,
+)
 from spdm_jax.trajectories import Frame, resample
 
 if TYPE_CHECKING:
@@ -29,8 +40,9 @@ class TorchScorer:
     for `[P, T]` on a CPU, where scenes run on all cores, once for `[B, P, T]` on an accelerator.
 
     Args:
-      scenes: from `spdm_jax.load` or `from_raw`.
-      dt: interval of the poses, s; resampled to 41 states at 0.1 s as `spdm_jax.score` does.
+      scenes: from `spdm_jax.load` or `from_raw`; for NAVSIM's profiles also from `load_navsim`.
+      dt: interval of the poses, s; resampled as `spdm_jax.score` does, which also says what None
+        stands for.
       frame: "ego" (x forward from the current rear axle), "local" (the scene's own) or "global"
         (map coordinates; float64 tensors only).
       tracker: "reference", "corrected", or "none" to differentiate the poses instead.
@@ -39,17 +51,19 @@ class TorchScorer:
       precision: "f32" or "f64"; also the type of the result.
       device: JAX device to compute on; the first one if None.
       threads: scenes at a time on a CPU, None for one per core.
+      profile: whose rules; see `spdm_jax.score`. NAVSIM's leave extended comfort out.
 
     Attributes:
+      components: names of the scores.
       programs: programs made or loaded from disk so far.
       compile_s: seconds that took.
     """
 
     def __init__(
         self,
-        scenes: ScenarioSet,
+        scenes: ScenarioSet | NavsimSet,
         *,
-        dt: float = DT,
+        dt: float | None = None,
         frame: Frame = "ego",
         tracker: Tracker | Literal["none"] = "reference",
         config: PlannerConfig | None = None,
@@ -57,16 +71,25 @@ class TorchScorer:
         precision: Precision = "f32",
         device: Any = None,
         threads: int | None = None,
+        profile: str = "tuplan",
     ):
         _check_settings(frame, tracker, precision)
-        config = config or PlannerConfig()
-        if tracker != "none":
-            config = replace(config, tracker=tracker)
+        rules = profile_named(profile)
+        scenes = _scenes_for(scenes, rules, precision, tracker, config)
         self._held = held_scenes(scenes, precision, device or jax.local_devices()[0])
-        config = replace(config, max_path_points=self._held.path_room)
         # Map coordinates become local ones before they are rounded to float32.
         inner: Frame = "local" if frame == "global" else frame
-        self._task = Task(config, tracker != "none", inner, float(dt))
+        step = DT if dt is None else float(dt)
+        if rules is TUPLAN:
+            config = config or PlannerConfig()
+            if tracker != "none":
+                config = replace(config, tracker=tracker)
+            config = replace(config, max_path_points=self._held.path_room)
+            self._task: AnyTask = Task(config, tracker != "none", inner, step)
+        else:
+            self._task = NavsimTask(rules, inner, step)
+        self._says_dt = dt is not None
+        self.components = components_of(self._task)
         self._global = frame == "global"
         self._params = self._held.params(params)
         self._threads = threads or usable_cores()
@@ -82,7 +105,7 @@ class TorchScorer:
           tokens: B scenes, in any order, repeated or not; all scenes in their order if None.
 
         Returns:
-          `[B, P]` for every name of `COMPONENTS`, on the device of `trajectories`. The work is
+          `[B, P]` for every name of `components`, on the device of `trajectories`. The work is
           finished when it returns.
 
         Raises:
@@ -91,7 +114,8 @@ class TorchScorer:
         """
         import torch  # pyright: ignore[reportMissingImports]
 
-        _check_tensor(trajectories, self._task.dt)
+        task = self._task_for(trajectories)
+        _check_tensor(trajectories, task.dt)
         rows = self._held.rows(tokens, len(trajectories))
         with torch.no_grad():
             if self._global:
@@ -99,13 +123,22 @@ class TorchScorer:
             wanted = torch.float64 if self._held.precision == "f64" else torch.float32
             trajectories = trajectories.to(wanted).contiguous()
             if self._held.device.platform == "cpu":
-                scores, problems = self._scene_by_scene(trajectories, rows)
+                scores, problems = self._scene_by_scene(task, trajectories, rows)
             else:
-                scores, problems = self._at_once(trajectories, rows)
+                scores, problems = self._at_once(task, trajectories, rows)
         self._held.refuse(rows, problems)
-        return dict(zip(COMPONENTS, scores, strict=True))
+        return dict(zip(self.components, scores, strict=True))
 
-    def _scene_by_scene(self, trajectories: Tensor, rows: np.ndarray) -> tuple[Tensor, np.ndarray]:
+    def _task_for(self, trajectories: Tensor) -> AnyTask:
+        """NAVSIM's own eight poses are 0.5 s apart, unless the user says otherwise."""
+        if self._says_dt or not isinstance(self._task, NavsimTask):
+            return self._task
+        shape = tuple(getattr(trajectories, "shape", ()))
+        return replace(self._task, dt=pose_interval(shape, None))
+
+    def _scene_by_scene(
+        self, task: AnyTask, trajectories: Tensor, rows: np.ndarray
+    ) -> tuple[Tensor, np.ndarray]:
         import torch  # pyright: ignore[reportMissingImports]
 
         held, device = self._held, trajectories.device
@@ -113,11 +146,11 @@ class TorchScorer:
             trajectories = trajectories.cpu()
         with x64(held.precision):
             shape = jax.ShapeDtypeStruct(tuple(trajectories.shape[1:]), held.dtype)
-            name = ("torch one scene", self._task, held.precision)
-            make = lambda: jax.jit(partial(score_rows, self._task))
+            name = ("torch one scene", task, held.precision)
+            make = lambda: jax.jit(partial(score_rows, task))
             made = self._program(name, make, (held.shape(), shape, self._params))
         count = trajectories.shape[:2]
-        scores = torch.empty((len(COMPONENTS), *count), dtype=trajectories.dtype)
+        scores = torch.empty((len(self.components), *count), dtype=trajectories.dtype)
         problems, into = np.zeros(count[0], np.int32), scores.numpy()
 
         def run(row: int) -> None:
@@ -134,13 +167,15 @@ class TorchScorer:
             list(held.pool(self._threads).map(run, range(count[0])))
         return scores.to(device), problems
 
-    def _at_once(self, trajectories: Tensor, rows: np.ndarray) -> tuple[Tensor, np.ndarray]:
+    def _at_once(
+        self, task: AnyTask, trajectories: Tensor, rows: np.ndarray
+    ) -> tuple[Tensor, np.ndarray]:
         held = self._held
         with x64(held.precision):
             poses = from_torch(trajectories, held.device)
             index = jax.device_put(rows.astype(np.int32), held.device)
-            name = ("torch batch", self._task, held.precision)
-            make = lambda: jax.jit(partial(score_batch, self._task))
+            name = ("torch batch", task, held.precision)
+            make = lambda: jax.jit(partial(score_batch, task))
             made = self._program(name, make, (held.shape(len(held)), index, poses, self._params))
             found = made.call(held.stacked(made), index, poses, self._params)
             # Reading one result waits for all: nobody may change the tensor before.
@@ -176,44 +211,47 @@ class TorchScorer:
 
 @overload
 def torch_score(
-    scenes: ScenarioSet,
+    scenes: ScenarioSet | NavsimSet,
     trajectories: Tensor,
     tokens: Sequence[str] | None = None,
     *,
     component: str = "total",
-    dt: float = DT,
+    dt: float | None = None,
     frame: Frame = "ego",
     tracker: Tracker | Literal["none"] = "reference",
     config: PlannerConfig | None = None,
     params: PlannerParams | None = None,
     precision: Precision = "f32",
+    profile: str = "tuplan",
 ) -> Tensor: ...
 @overload
 def torch_score(
-    scenes: ScenarioSet,
+    scenes: ScenarioSet | NavsimSet,
     trajectories: Tensor,
     tokens: Sequence[str] | None = None,
     *,
     component: tuple[str, ...] | list[str],
-    dt: float = DT,
+    dt: float | None = None,
     frame: Frame = "ego",
     tracker: Tracker | Literal["none"] = "reference",
     config: PlannerConfig | None = None,
     params: PlannerParams | None = None,
     precision: Precision = "f32",
+    profile: str = "tuplan",
 ) -> dict[str, Tensor]: ...
 def torch_score(
-    scenes: ScenarioSet,
+    scenes: ScenarioSet | NavsimSet,
     trajectories: Tensor,
     tokens: Sequence[str] | None = None,
     *,
     component: str | Sequence[str] = "total",
-    dt: float = DT,
+    dt: float | None = None,
     frame: Frame = "ego",
     tracker: Tracker | Literal["none"] = "reference",
     config: PlannerConfig | None = None,
     params: PlannerParams | None = None,
     precision: Precision = "f32",
+    profile: str = "tuplan",
 ) -> Tensor | dict[str, Tensor]:
     """Scores torch trajectories with the PDM score; see `TorchScorer` for settings and errors.
 
@@ -225,21 +263,21 @@ def torch_score(
       scenes: from `spdm_jax.load` or `from_raw`.
       trajectories: `[B, P, T, 3]` rear-axle poses x, y, heading; any floating type.
       tokens: B scenes, in any order, repeated or not; all scenes in their order if None.
-      component: a name of `COMPONENTS`, or several.
+      component: a name of `COMPONENTS` (of `navsim.results.COMPONENTS` for NAVSIM's profiles), or
+        several.
       dt: see `TorchScorer`, like what follows.
       frame: see above.
       tracker: see above.
       config: see above.
       params: see above; None is fastest, others go to the device at every call.
       precision: see above.
+      profile: see above.
 
     Returns:
       `[B, P]` on the device of `trajectories`, or component -> `[B, P]` where several are asked
       for.
     """
     names = (component,) if isinstance(component, str) else tuple(component)
-    if unknown := [name for name in names if name not in COMPONENTS]:
-        raise ValueError(f"no component {unknown[0]!r}; there are {', '.join(COMPONENTS)}")
     scorer = TorchScorer(
         scenes,
         dt=dt,
@@ -248,7 +286,11 @@ def torch_score(
         config=config,
         params=params,
         precision=precision,
+        profile=profile,
     )
+    if unknown := [name for name in names if name not in scorer.components]:
+        known = ", ".join(scorer.components)
+        raise ValueError(f"no component {unknown[0]!r}; there are {known}")
     found = scorer(trajectories, tokens)
     return found[component] if isinstance(component, str) else {name: found[name] for name in names}
 
@@ -269,6 +311,26 @@ def to_torch(array: jax.Array, device: Any) -> Tensor:
     if (device.type == "cpu") == (place.platform == "cpu"):
         return torch.from_dlpack(array).to(device)
     return torch.from_numpy(np.array(array)).to(device)
+
+
+def _scenes_for(
+    scenes: ScenarioSet | NavsimSet,
+    rules: Profile,
+    precision: Precision,
+    tracker: str,
+    config: PlannerConfig | None,
+) -> ScenarioSet | NavsimSet:
+    """Returns what a profile is scored in.
+
+    Raises:
+      ValueError: scenes or settings do not go with the profile.
+    """
+    if rules is TUPLAN:
+        return scenarios_only(scenes)
+    refuse_foreign(tracker=tracker, config=config)
+    frames = to_navsim(scenes, precision=precision)
+    frames.require(rules)
+    return frames
 
 
 def _check_settings(frame: str, tracker: str, precision: str) -> None:

@@ -53,6 +53,9 @@ def test_profiles_that_a_frame_serves(tmp_path: Path, arrays: dict[str, np.ndarr
     with pytest.raises(ValueError, match=r"frame old: exported with NAVSIM v1.*not navsim2; .*v2"):
         found.require(NAVSIM2)
     assert "1 frames, NAVSIM v1" in repr(found)
+    left = found.serving(NAVSIM2)
+    assert len(left) == 0 and "not navsim2" in left.failures[0].reason
+    assert found.serving(NAVSIM1).tokens == ["old"]
 
 
 @pytest.mark.parametrize(
