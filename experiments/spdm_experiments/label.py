@@ -19,6 +19,7 @@ from spdm_experiments.label_folder import (
 )
 from spdm_experiments.label_scene import COMPONENTS, Switches
 from spdm_experiments.label_work import MEMORY, Chunk, Group, Labeller, index_row
+from spdm_experiments.navsim_files import refuse_frames
 from spdm_experiments.options import Label
 from spdm_experiments.parts import part_name
 from spdm_experiments.runtime import configure_jax, now, provenance
@@ -26,6 +27,7 @@ from spdm_experiments.sequence import Verb, go_on, usable_inventory
 from spdm_experiments.work import Done
 from spdm_jax import Failure, PlannerConfig
 from spdm_jax.batching import ShapeGroup, group_by_shape
+from spdm_jax.config import DT
 from spdm_jax.labels import INDEX
 from spdm_jax.padding import PATH_ROOM, bucket
 from spdm_jax.trajectories import check_trajectories, resample
@@ -46,6 +48,19 @@ def read_vocabulary(path: Path, dt: float) -> np.ndarray:
     Raises:
       ValueError: the file holds no such array.
     """
+    values = stored_vocabulary(path)
+    try:
+        return resample(check_trajectories(values, dt, 1), dt)[0]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def stored_vocabulary(path: Path) -> np.ndarray:
+    """Reads a vocabulary as it is stored, `[V, T, 3]` float64.
+
+    Raises:
+      ValueError: the file holds no such array.
+    """
     try:
         content = np.load(path, allow_pickle=False)
         values = content if isinstance(content, np.ndarray) else content["trajectories"]
@@ -56,10 +71,7 @@ def read_vocabulary(path: Path, dt: float) -> np.ndarray:
             f"{path}: {values.dtype} {values.shape}; a vocabulary is [V, T, 3] of floating-point "
             "numbers, the same in every scenario. One set per scenario goes to: spdm score"
         )
-    try:
-        return resample(check_trajectories(values.astype(np.float64), dt, 1), dt)[0]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return values.astype(np.float64)
 
 
 def parse_components(text: str) -> tuple[str, ...]:
@@ -91,13 +103,19 @@ def run_label(options: Label) -> bool:
     shard = Shard.parse(options.shard)
     if options.chunk < 1:
         raise ValueError(f"--chunk is {options.chunk}; it must be at least 1")
+    if options.profile != "tuplan":
+        from spdm_experiments.navsim_label import run_navsim_label
+
+        return run_navsim_label(options, shard)
     labeller = Labeller(
-        read_vocabulary(options.vocabulary, options.dt),
+        read_vocabulary(options.vocabulary, DT if options.dt is None else options.dt),
         parse_components(options.components),
         DTYPES[options.dtype],
         options.precision,
     )
-    inventory = usable_inventory(scenario_files(options.scenes, options.limit), options.scenes)
+    files = scenario_files(options.scenes, options.limit)
+    refuse_frames(options.scenes, files)
+    inventory = usable_inventory(files, options.scenes)
     configure_jax(options)
     return go_on(LabelRun(options, labeller, inventory), inventory, shard)
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from spdm_experiments.navsim_options import Profiled, WithPrevious
 from spdm_experiments.option_bases import (
     Chunked,
     Common,
@@ -141,7 +142,7 @@ class Plan(Chunked, Planner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score(Chunked):
+class Score(Chunked, WithPrevious):
     """Score given trajectories with the PDM sub-scores.
 
     Ctrl-C ends the run after the chunk at hand. What is done is in the folder by then. A scenario
@@ -154,8 +155,6 @@ class Score(Chunked):
     "trajectories"; "tokens" [S] beside them says which scenario each set belongs to."""
     out: Path = Path("out/score")
     """Folder to write: rows.parquet and run.json."""
-    dt: float = 0.1
-    """Spacing of the trajectories' poses, s."""
     frame: Literal["ego", "local", "global"] = "ego"
     """Frame of the poses: the ego's current rear axle, the scenario's own, or the map's."""
     tracker: Literal["reference", "corrected", "none"] = "reference"
@@ -257,7 +256,7 @@ class Report(OnDevice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Label(Compute):
+class Label(Compute, Profiled):
     """Score the same vocabulary in every scenario and write labels to train from.
 
     The same command goes on where an interrupted one stopped, also after a kill. A scenario that
@@ -272,11 +271,10 @@ class Label(Compute):
     """Folder to write or to go on with."""
     components: str = "all"
     """Sub-scores to keep, between commas, or all: total, no_at_fault_collision, drivable_area,
-    driving_direction, time_to_collision, comfort, progress, progress_raw."""
+    driving_direction, time_to_collision, comfort, progress, progress_raw; with NAVSIM's profiles
+    also traffic_light and lane_keeping."""
     dtype: Literal["f16", "f32"] = "f16"
     """Type of the labels; computation is in --precision."""
-    dt: float = 0.1
-    """Spacing of the vocabulary's poses, s."""
     tracker: Literal["reference", "corrected", "none"] = "reference"
     """Track the trajectories first, as the planner does; none scores them as they are."""
     forecast: Forecast = "constant_velocity"

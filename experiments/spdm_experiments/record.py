@@ -15,7 +15,7 @@ import numpy as np
 import polars
 
 from spdm_experiments.runtime import Clock, now, provenance
-from spdm_jax import Failure, PlanSet, ScenarioSet, ScoreSet
+from spdm_jax import Failure, NavsimScoreSet, PlanSet, ScenarioSet, ScoreSet
 from spdm_jax.io.scenario_file import write_atomically
 
 ROWS = "rows.parquet"
@@ -45,7 +45,7 @@ class Record:
         for name in (RUN, ROWS, TRAJECTORIES):
             (folder / name).unlink(missing_ok=True)
 
-    def add(self, result: ScoreSet) -> None:
+    def add(self, result: ScoreSet | NavsimScoreSet) -> None:
         """Takes the rows of a result; scenes that are not "ok" become failures without scores."""
         self._frames.append(rows(result).filter(polars.col("status") == "ok"))
         self.failed |= {failure.token: failure.reason for failure in unusable(result)}
@@ -106,7 +106,7 @@ class Record:
             self.files.append(path)
 
 
-def rows(result: ScoreSet) -> polars.DataFrame:
+def rows(result: ScoreSet | NavsimScoreSet) -> polars.DataFrame:
     """Returns one row per real proposal: `to_table`, and for plans what the planner knew of it."""
     table = dataclasses.replace(result, failures=[]).to_table()
     if not isinstance(result, PlanSet):
@@ -131,7 +131,7 @@ REASONS = {
 }
 
 
-def unusable(result: ScoreSet) -> list[Failure]:
+def unusable(result: ScoreSet | NavsimScoreSet) -> list[Failure]:
     """Returns the scenes of a result whose scores are not to be used, with reasons."""
     return [
         Failure(info.token, REASONS[status])

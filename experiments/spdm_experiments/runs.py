@@ -9,6 +9,7 @@ from rich.table import Table
 
 from spdm_experiments import tables
 from spdm_experiments.chunks import Survey, chunks, head, keep, scenario_files, suite_name, survey
+from spdm_experiments.navsim_files import refuse_frames
 from spdm_experiments.options import Chunked, Plan, Score, Show
 from spdm_experiments.planners import describe, make_planner
 from spdm_experiments.record import RUN, Record, unusable
@@ -18,6 +19,7 @@ from spdm_experiments.trajectory_file import read_trajectories
 from spdm_jax import PlannerConfig, PlanSet, ScenarioSet, ScoreSet, load
 from spdm_jax import plan as plan_scenes
 from spdm_jax import score as score_scenes
+from spdm_jax.config import DT
 
 MAX_LINES = 20
 """Scenes listed on the terminal; the rows file has them all."""
@@ -47,7 +49,7 @@ def run_plan(options: Plan) -> bool:
             drawn.extend(_draw(options, scenes, result, about))
 
     finished = _go_through(options, found, record, clock, compute, take)
-    return _close(record, table, clock, found, drawn, finished)
+    return close(record, table, clock, found, drawn, finished)
 
 
 def run_score(options: Score) -> bool:
@@ -56,14 +58,21 @@ def run_score(options: Score) -> bool:
     Raises:
       ValueError: options or files are of no use.
     """
+    if options.profile != "tuplan":
+        from spdm_experiments.navsim_score import run_navsim_score
+
+        return run_navsim_score(options)
+    if options.previous is not None:
+        raise ValueError("--previous is for --profile navsim2; the tuplan score ignores it")
     found, clock = _survey(options)
-    values = read_trajectories(options.trajectories, options.dt, found)
+    dt = DT if options.dt is None else options.dt
+    values = read_trajectories(options.trajectories, dt, found)
     config = PlannerConfig(forecast=options.forecast, progress_reference=options.progress_reference)
     about = {
         **_about("score", options, found),
         "trajectories": str(options.trajectories),
         "trajectories_shape": list(values.shape),
-        "dt": options.dt,
+        "dt": dt,
         "frame": options.frame,
         "tracker": options.tracker,
         "forecast": options.forecast,
@@ -80,7 +89,7 @@ def run_score(options: Score) -> bool:
         return score_scenes(
             scenes,
             mine,
-            dt=options.dt,
+            dt=dt,
             frame=options.frame,
             tracker=options.tracker,
             config=config,
@@ -91,7 +100,7 @@ def run_score(options: Score) -> bool:
         tables.add_scores(table, result, _listed(result, done))
 
     finished = _go_through(options, found, record, clock, compute, take)
-    return _close(record, table, clock, found, [], finished)
+    return close(record, table, clock, found, [], finished)
 
 
 def run_show(options: Show) -> bool:
@@ -141,7 +150,9 @@ def run_show(options: Show) -> bool:
 def _survey(options: Chunked) -> tuple[Survey, Clock]:
     clock = Clock()
     with clock.loading():
-        found = survey(scenario_files(options.scenes, options.limit))
+        files = scenario_files(options.scenes, options.limit)
+        refuse_frames(options.scenes, files)
+        found = survey(files)
     return found, clock
 
 
@@ -219,7 +230,7 @@ def _draw(options: Plan, scenes: ScenarioSet, result: PlanSet, about: dict) -> l
     return written
 
 
-def _close(
+def close(
     record: Record, table: Table, clock: Clock, found: Survey, drawn: list[Path], finished: bool
 ) -> bool:
     """Prints the outcome; returns False if a scenario failed.

@@ -8,6 +8,18 @@ from spdm_experiments.chunks import Survey
 from spdm_jax.trajectories import check_trajectories, resample
 
 
+def stored_shape(path: Path) -> tuple[int, ...]:
+    """Returns the shape of a file's trajectories, () where `read_trajectories` will refuse it."""
+    try:
+        content = np.load(path, allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            return content.shape
+        with content:
+            return content["trajectories"].shape
+    except (ValueError, EOFError, KeyError):
+        return ()
+
+
 def read_trajectories(path: Path, dt: float, found: Survey) -> np.ndarray:
     """Reads a trajectory file and brings it to the order of the scenarios.
 
