@@ -17,6 +17,7 @@ from spdm_experiments.options import (
     Demo,
     Doctor,
     Label,
+    NavsimScript,
     Options,
     Pack,
     Plan,
@@ -80,6 +81,8 @@ def run(options: Options | Train) -> bool:
             return commands.doctor(options)
         case Label():
             return commands.label(options)
+        case NavsimScript():
+            return commands.navsim_script(options)
         case Pack():
             return commands.pack(options)
         case Plan():

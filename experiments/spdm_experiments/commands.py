@@ -13,6 +13,7 @@ from spdm_experiments.options import (
     Demo,
     Doctor,
     Label,
+    NavsimScript,
     Pack,
     Plan,
     Report,
@@ -163,6 +164,20 @@ def label(options: Label) -> bool:
     from spdm_experiments.label import run_label
 
     return run_label(options)
+
+
+def navsim_script(options: NavsimScript) -> bool:
+    """Writes the script that exports NAVSIM's metric caches."""
+    import shutil
+
+    from spdm_jax.navsim import navsim_export
+
+    shutil.copyfile(navsim_export.__file__, options.destination)
+    print(
+        f"{options.destination}: run it with the Python of your NAVSIM installation:\n"
+        f"  python {options.destination} METRIC_CACHE OUT"
+    )
+    return True
 
 
 def vocab(options: Vocab) -> bool:

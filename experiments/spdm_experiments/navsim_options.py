@@ -2,7 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from spdm_experiments.option_bases import Common
 
 ProfileName = Literal["tuplan", "navsim1", "navsim2", "navsim2_unfiltered"]
 
@@ -27,3 +31,14 @@ class WithPrevious(Profiled):
     """Plans of the frame before, for navsim2: a .npz file of "tokens" [S] and "trajectories"
     [S, 8, 3] or [S, P, 8, 3], in the ego frame of that frame. Frames that it does not name go
     without extended comfort."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NavsimScript(Common):
+    """Write the script that exports NAVSIM's metric caches.
+
+    Run it with the Python of your NAVSIM installation: python DST METRIC_CACHE OUT.
+    """
+
+    destination: Annotated[Positional[Path], arg(metavar="DST")] = Path("navsim_export.py")
+    """File to write."""

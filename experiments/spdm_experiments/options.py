@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from spdm_experiments.navsim_options import Profiled, WithPrevious
+from spdm_experiments.navsim_options import NavsimScript, Profiled, WithPrevious
 from spdm_experiments.option_bases import (
     Chunked,
     Common,
@@ -31,6 +31,7 @@ __all__ = [
     "Doctor",
     "Format",
     "Label",
+    "NavsimScript",
     "OnDevice",
     "Options",
     "OverGrid",
@@ -322,5 +323,17 @@ class Vocab(Compute):
 
 
 Options = (
-    Convert | Demo | Doctor | Label | Pack | Plan | Report | Score | Show | Simulate | Sweep | Vocab
+    Convert
+    | Demo
+    | Doctor
+    | Label
+    | NavsimScript
+    | Pack
+    | Plan
+    | Report
+    | Score
+    | Show
+    | Simulate
+    | Sweep
+    | Vocab
 )

@@ -11,6 +11,7 @@ import spdm_jax
 from navsim_stand_in import straight
 from spdm_experiments.cli import main
 from spdm_jax import NavsimSet, open_labels
+from spdm_jax.navsim import navsim_export
 from spdm_jax.navsim.results import component
 
 DRIVES = np.concatenate([straight(8.0, 16.0, 0.5), straight(8.0, left=-0.6)])
@@ -122,3 +123,10 @@ def test_unknown_component(exported: Path, files: Path, capsys):
     given = ("label", exported, files / "drives.npy", "--out", files / "out")
     assert run(*given, "--profile", "navsim2", "--components", "total,speed") == 2
     assert "no component 'speed' in navsim2; there are all, total" in capsys.readouterr().err
+
+
+def test_script_for_the_devkit_is_written(tmp_path: Path, capsys):
+    path = tmp_path / "navsim_export.py"
+    assert main(["navsim-script", str(path)]) == 0
+    assert path.read_text() == Path(navsim_export.__file__).read_text()
+    assert f"python {path} METRIC_CACHE OUT" in capsys.readouterr().out
