@@ -1,4 +1,4 @@
-"""A sweep in a process of its own that stops at a chosen moment, so that it can be killed there.
+"""A run in a process of its own that stops at a chosen moment, so that it can be killed there.
 
     python sweep_child.py MOMENT COUNT ARGUMENTS...
 
@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import jax.numpy as jnp
 
-from spdm_experiments import cli, grid_run, run_folder, sweep_work
+from spdm_experiments import cli, grid_run, run_folder, simulate_work, sweep_work
 from spdm_experiments.sweep_scene import Poses, Reading
 from spdm_jax.results import SCORE_COLUMNS
 
@@ -61,8 +61,8 @@ def stop_at(moment: str, count: int) -> None:
             print("stopped", flush=True)
             sys.stdin.readline()
 
-    folder, local, engine = cast(Any, run_folder), cast(Any, grid_run), sweep_work.SweepEngine
-    write, load, process = folder.write_atomically, local.load_chunk, engine.process
+    folder, local = cast(Any, run_folder), cast(Any, grid_run)
+    write, load = folder.write_atomically, local.load_chunk
 
     def writing(path: Path, content: bytes) -> None:
         if path.suffix == ".parquet" and moment == "half a part":
@@ -78,14 +78,18 @@ def stop_at(moment: str, count: int) -> None:
             hold()
         return load(*given)
 
-    def processing(self: Any, loaded: Any) -> Any:
-        if moment == "compute":
-            hold()
-        return process(self, loaded)
+    def held(process: Any) -> Any:
+        def processing(self: Any, loaded: Any) -> Any:
+            if moment == "compute":
+                hold()
+            return process(self, loaded)
+
+        return processing
 
     folder.write_atomically = writing
     local.load_chunk = loading
-    engine.process = processing
+    for engine in (sweep_work.SweepEngine, simulate_work.SimulateEngine):
+        engine.process = held(engine.process)
 
 
 def main() -> int:
