@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from spdm_jax.config import NUM_STATES, VehicleParams
 from spdm_jax.geometry import Path
@@ -20,10 +21,12 @@ from spdm_jax.navsim.types import (
     RedConnectors,
 )
 from spdm_jax.trajectories import STATE_COLUMNS
-from spdm_jax.types import EgoState, ObjectType
+from spdm_jax.types import Array, EgoState, ObjectType
 
 _STATE = len(STATE_COLUMNS)
 _NUM_KINDS = layers.CAR_PARK + 1
+# NAVSIM's map reaches 100 m from the ego; polygons are whole.
+_MAX_REACH = 2000.0
 
 
 def from_arrays(arrays: Mapping[str, Any], *, name: str = "scene") -> NavsimScene:
@@ -112,16 +115,15 @@ def _centerline(fields: Fields, origin: np.ndarray) -> Path:
     if len(points) < 2:
         raise fields.error("centerline", f"has {len(points)} points; it needs two or more")
     x, y = (points[:, :2] - origin).T
-    progress = np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y))))
+    progress: Array = np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y))))
     if progress[-1] <= 0:
         raise fields.error("centerline", "has no length: all its points are one")
-    count = np.array(len(points), np.int32)
-    return Path(x, y, np.unwrap(points[:, 2]), progress, count, progress[-1])
+    heading: Array = np.unwrap(points[:, 2])
+    count: Array = np.array(len(points), np.int32)
+    return Path(x, y, heading, progress, count, progress[-1])
 
 
-def _map(
-    fields: Fields, origin: np.ndarray
-) -> tuple[list[shapely.Geometry], np.ndarray, np.ndarray]:
+def _map(fields: Fields, origin: np.ndarray) -> tuple[list[BaseGeometry], np.ndarray, np.ndarray]:
     kind = fields.integers("map_kind", (None,))
     on_route = fields.flags("map_on_route", (len(kind),))
     fields.within("map_kind", kind, 0, _NUM_KINDS - 1)
@@ -136,7 +138,15 @@ def _map(
     missing = np.setdiff1d(np.arange(len(kind)), owner)
     if len(missing):
         raise fields.error("map_ring_object", f"names no ring of map object {missing[0]}")
-    parts: list[list[shapely.Geometry]] = [[] for _ in kind]
+    far = [np.abs(ring - origin).max() for ring in rings]
+    if max(far) > _MAX_REACH:
+        ring = int(np.argmax(far))
+        raise fields.error(
+            "map_ring_xy",
+            f"puts ring {ring} {max(far):.0f} m from the ego, {_MAX_REACH:.0f} m are the most; are "
+            "map and ego in the same frame?",
+        )
+    parts: list[list[BaseGeometry]] = [[] for _ in kind]
     for ring, row in zip(rings, owner, strict=True):
         polygon = shapely.Polygon(ring - origin)
         parts[row].append(polygon if polygon.is_valid else shapely.make_valid(polygon))

@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from spdm_jax.config import VehicleParams
 from spdm_jax.io.grid import build_grid
 from spdm_jax.scoring.areas import AreaMasks
-from spdm_jax.types import PolygonGrid
+from spdm_jax.types import Array, PolygonGrid
 
 BLOCK, LANE, CONNECTOR, INTERSECTION, CAR_PARK = range(5)
 """Kinds of map polygons, numbered as in the exported frames."""
@@ -87,7 +87,7 @@ def map_layers(
     return grid, masks
 
 
-def _words(bits: Sequence[int], words: int) -> np.ndarray:
+def _words(bits: Sequence[int], words: int) -> Array:
     packed = np.zeros(words, np.uint32)
     for bit in bits:
         packed[bit >> 5] |= np.uint32(1 << (bit & 31))

@@ -1,6 +1,6 @@
 """NAVSIM's PDM score of predicted trajectories in one frame (pure; `jax.vmap` gives the batch)."""
 
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,13 @@ from spdm_jax.navsim.observation import replay
 from spdm_jax.navsim.types import NavsimScene, NavsimScores, Sampling, Terms
 from spdm_jax.scoring.aggregate import relative_progress
 from spdm_jax.scoring.history_comfort import extended_comfort
-from spdm_jax.scoring.profile import Profile
+from spdm_jax.scoring.profile import Profile, Term
 from spdm_jax.scoring.score import Judged, World, judge
 from spdm_jax.tracking.lqr import track
 from spdm_jax.trajectories import STATE_COLUMNS
 from spdm_jax.types import Array, EgoState
 
-_UNFILTERED = ("extended_comfort",)
+_UNFILTERED: tuple[Term, ...] = ("extended_comfort",)
 """Sub-scores that the human filter leaves alone."""
 
 
@@ -252,12 +252,11 @@ def _product(terms: Terms, profile: Profile) -> jax.Array:
 
 def _filtered(terms: Terms, human: Terms, profile: Profile) -> Terms:
     """Sub-scores in which nobody is held to what the human failed."""
-    names = [name for name in Terms.__dataclass_fields__ if name not in _UNFILTERED]
     return terms.replace(
         **{
             name: jnp.where(getattr(human, name) == 0, 1, getattr(terms, name))
-            for name in names
-            if profile.judges(name)
+            for name in get_args(Term)
+            if profile.judges(name) and name not in _UNFILTERED
         }
     )
 

@@ -21,6 +21,7 @@ from .models_dipp import check_dipp  # noqa: E402
 from .models_dtpp import check_dtpp  # noqa: E402
 from .models_gameformer import check_gameformer  # noqa: E402
 from .models_gameformer_planner import check_gameformer_planner  # noqa: E402
+from .navsim import check_navsim  # noqa: E402
 from .pdm import check_scene, check_scorer  # noqa: E402
 from .planning import check_planning  # noqa: E402
 from .report import Report  # noqa: E402
@@ -77,6 +78,8 @@ def run(folder: Path, precision: str, only: str = "") -> Report:
                     report.add_loader_row(f"{path.parent.name}/{path.name}", row)
         elif path.suffix != ".npz":
             continue
+        elif check_navsim(path, report, dtype):
+            pass
         elif path.name.startswith("unit_") and check_unit(path, report, dtype):
             pass
         elif any([check(path, report, dtype) for check in by_description]):

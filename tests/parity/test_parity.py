@@ -11,6 +11,7 @@ GOLDEN = ROOT.parent / "shared" / "golden"
 FEW = ("unit_comfort", "unit_path", "unit_lqr", "unit_driving_direction")
 FEW_SIMULATED = ("single_steps", "curve_tail", "yellow_then_red", "random_4")
 FEW_RUNS = ("random_5", "offroad_0p2", "sn_none_speed_limit")
+FEW_FRAMES = ("scene_cut_in", "scene_red_light", "unit_comfort", "unit_two_stage_weights")
 FEW_PLANNERS = (
     "dipp/planner_f64_seed1",
     "gameformer/planner_seed0",
@@ -68,6 +69,15 @@ def test_simulation(golden: Path, tmp_path: Path, precision: str):
         for path in cases.glob(f"*/{name}.*"):
             (tmp_path / path.name).symlink_to(path)
     (tmp_path / "maps").symlink_to(cases / "idm" / "maps")
+    assert ", 0 failed" in compare(tmp_path, precision)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_navsim(golden: Path, tmp_path: Path, precision: str):
+    for name in FEW_FRAMES:
+        path = golden.with_name("navsim") / f"{name}.npz"
+        (tmp_path / path.name).symlink_to(path)
     assert ", 0 failed" in compare(tmp_path, precision)
 
 
