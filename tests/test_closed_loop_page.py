@@ -44,7 +44,13 @@ Scores = Mapping[tuple[str, str], Sequence[float]]
 
 
 def write_run(
-    folder: Path, suite: Suite, scores: Scores, *, failed: tuple[str, ...] = (), **about: Any
+    folder: Path,
+    suite: Suite,
+    scores: Scores,
+    *,
+    failed: tuple[str, ...] = (),
+    run_ms: float = 100.0,
+    **about: Any,
 ) -> Run:
     """Writes a run folder of a suite.
 
@@ -53,6 +59,7 @@ def write_run(
       suite: gives the points.
       scores: row name and traffic -> score of each of `TOKENS`; 0.5 where left out.
       failed: tokens that SPDM 60 failed in.
+      run_ms: of a drive, without what its proposals add.
       about: entries of run.json that differ from the usual.
     """
     points = [point.entry(number) for number, point in enumerate(suite.points())]
@@ -72,7 +79,7 @@ def write_run(
                 "no_ego_at_fault_collisions": float(score > 0),
                 "progress_m": 30.0,
                 "samples": 10,
-                "run_ms": 100.0 + (point["num_proposals"] or 0),
+                "run_ms": run_ms + (point["num_proposals"] or 0),
             }
             if name == "SPDM 60" and token in failed:
                 row |= {"status": "failed", "reason": "no reason", "score": None}
@@ -255,6 +262,19 @@ def test_unfinished_runs_say_so(tmp_path: Path):
     closed_loop_page.write_page(tmp_path / "page.md", [run], ABOUT)
     found = table((tmp_path / "page.md").read_text(encoding="utf-8"), "# Closed loop")
     assert found["scenarios"] == ["6 of 80: the run goes on"]
+
+
+def test_run_times_can_be_those_of_another_run(runs: list[Run], tmp_path: Path):
+    quiet = [write_run(tmp_path / s.name, s, {}, run_ms=40.0) for s in SUITES]
+    closed_loop_page.write_page(tmp_path / "page.md", runs, ABOUT, timed=quiet)
+    text = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert table(text, "## Run time")["SPDM 60"] == ["10.00", "10.00", "10.00"]
+    assert table(text, "### interactive-8, reactive")["SPDM 60"] == ["75.0", "25.0"]
+    other = dataclasses.replace(SUITES[1], lineup=SUITES[1].lineup[:1])
+    wrong = [quiet[0], write_run(tmp_path / "other", other, {})]
+    for timed in (quiet[:1], wrong):
+        with pytest.raises(ValueError, match="interactive-8: the timed run is missing or of other"):
+            closed_loop_page.write_page(tmp_path / "page.md", runs, ABOUT, timed=timed)
 
 
 def test_page_is_repeatable_and_keeps_what_people_wrote(

@@ -3,6 +3,7 @@
 `run` drives every planner of the line-up through the built-in suites, as `spdm simulate` does;
 `precision` drives two of them in float64 as well and compares; `page` only writes the page. Each
 suite and precision has a run folder below --out: the same command goes on where it was stopped.
+Run times can be those of another run, of fewer scenarios (--limit) on a quiet machine: --times.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from spdm_experiments.closed_loop_page import write_page
 from spdm_experiments.closed_loop_precision import Pair, compare
 from spdm_experiments.inventory import Shard
 from spdm_experiments.options import Simulate
-from spdm_experiments.report_data import load_run
+from spdm_experiments.report_data import Run, load_run
 from spdm_experiments.sequence import go_on
 from spdm_experiments.simulate import SimulateRun
 from spdm_jax.batching import usable_cores
@@ -97,7 +98,7 @@ def main(argv: Sequence[str] | None = None, suites: Sequence[Suite] = SUITES) ->
             good, found = drive_in_double(suites, options, given.limit)
             write_atomically(given.out / PRECISION, (json.dumps(found, indent=1) + "\n").encode())
         if given.page:
-            for path in _write(given.page, given.out, suites):
+            for path in _write(given.page, given.out, suites, given.times):
                 print(f"written: {path}")
         return 0 if good else EXIT_FAILED
     except KeyboardInterrupt:
@@ -118,6 +119,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("step", nargs="?", choices=steps, default="run", help="what to do")
     parser.add_argument("--out", type=Path, default=Path("out/closed_loop"), help="run folders")
     parser.add_argument("--page", type=Path, help="Markdown page to write, with figures beside it")
+    parser.add_argument("--times", type=Path, help="another --out, whose run times the page shows")
     parser.add_argument("--limit", type=int, help="take so many scenarios of each type only")
     parser.add_argument("--chunk", type=int, default=CHUNK, help="scenarios between two stops")
     parser.add_argument("--device", choices=("auto", "cpu", "gpu"), default="auto")
@@ -130,6 +132,8 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--page {options.page} must end in .md")
     if options.step == "page" and not options.page:
         parser.error("page needs --page, the Markdown file to write")
+    if options.times and not options.page:
+        parser.error("--times needs --page, the Markdown file that shows them")
     return options
 
 
@@ -148,18 +152,24 @@ def note_machine(out: Path, command: str) -> None:
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
-def _write(page: Path, out: Path, suites: Sequence[Suite]) -> list[Path]:
+def _write(page: Path, out: Path, suites: Sequence[Suite], times: Path | None) -> list[Path]:
     """Writes the page of the runs that are there.
 
     Raises:
-      ValueError: there is none.
+      ValueError: there is none, or the run times are not those of the same planners.
     """
-    there = [out / suite.name for suite in suites if any((out / suite.name).glob("rows/*"))]
-    if not there or not (out / ABOUT).is_file():
+    if not (runs := _load(out, suites)) or not (out / ABOUT).is_file():
         raise ValueError(f"{out}: no rows yet; run first: python -m spdm_experiments.closed_loop")
     read = lambda name: json.loads((out / name).read_text(encoding="utf-8"))
     precision = read(PRECISION) if (out / PRECISION).is_file() else None
-    return write_page(page, [load_run(folder) for folder in there], read(ABOUT), precision)
+    timed = None if times is None else _load(times, suites)
+    return write_page(page, runs, read(ABOUT), precision, timed=timed)
+
+
+def _load(out: Path, suites: Sequence[Suite]) -> list[Run]:
+    """Reads the runs of the suites that have rows."""
+    folders = [out / suite.name for suite in suites]
+    return [load_run(folder) for folder in folders if any(folder.glob("rows/*"))]
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ class Panel:
       points: row name -> number of the point, in the order of the tables.
       summaries: row name -> means and intervals.
       step_ms: row name -> mean run time of a drive over its steps; NaN where nothing is known.
+      timed: scenarios whose run times are meant.
     """
 
     run: Run
@@ -37,6 +38,7 @@ class Panel:
     points: Mapping[str, int]
     summaries: Mapping[str, PointSummary]
     step_ms: Mapping[str, float]
+    timed: int
 
     @property
     def suite(self) -> str:
@@ -75,15 +77,28 @@ class Difference:
     high: float
 
 
-def panels_of(runs: Sequence[Run], seed: int = 0) -> list[Panel]:
+def panels_of(
+    runs: Sequence[Run], seed: int = 0, timed: Sequence[Run] | None = None
+) -> list[Panel]:
     """Splits runs by traffic, in the order of their points.
 
     Args:
       runs: one per suite.
       seed: of the bootstrap.
+      timed: runs of the same suites and points whose run times are shown; `runs` by default.
+
+    Raises:
+      ValueError: a suite was timed with other points, or not at all.
     """
+    clocks = {str(run.about["suite"]): run for run in (runs if timed is None else timed)}
     found = []
     for run in runs:
+        clock = clocks.get(str(run.about["suite"]))
+        if clock is None or clock.points != run.points:
+            raise ValueError(
+                f"{run.about['suite']}: the timed run is missing or of other planners; make it "
+                "with the same version of the program"
+            )
         summaries = summarise(run, seed)
         for traffic in dict.fromkeys(point["traffic"] for point in run.points):
             points = {
@@ -97,7 +112,8 @@ def panels_of(runs: Sequence[Run], seed: int = 0) -> list[Panel]:
                     traffic=traffic,
                     points=points,
                     summaries={name: summaries[number] for name, number in points.items()},
-                    step_ms={name: _step_ms(run, number) for name, number in points.items()},
+                    timed=clock.about["num_scenarios"] - clock.missing,
+                    step_ms={name: _step_ms(clock, number) for name, number in points.items()},
                 )
             )
     return found

@@ -31,6 +31,7 @@ def write_page(
     about: Mapping[str, Any],
     precision: Mapping[str, Any] | None = None,
     seed: int = 0,
+    timed: Sequence[Run] | None = None,
 ) -> list[Path]:
     """Writes the page and its figures.
 
@@ -40,12 +41,16 @@ def write_page(
       about: `command`, and `machines` that worked on the runs.
       precision: what `closed_loop_precision.compare` found, or None.
       seed: of the bootstrap.
+      timed: runs whose run times are shown, see `panels_of`.
 
     Returns:
       The files written.
+
+    Raises:
+      ValueError: `timed` does not go with `runs`.
     """
     kept = kept_part(page, KEPT)
-    panels = panels_of(runs, seed)
+    panels = panels_of(runs, seed, timed)
     page.parent.mkdir(parents=True, exist_ok=True)
     figures = write_figures(panels, page, _origin(runs, about), seed)
     parts = [
@@ -62,7 +67,7 @@ def write_page(
         "## What costs points\n",
         _metrics(panels),
         "## Run time per planning step\n",
-        _runtime(panels, about),
+        _runtime(panels, runs if timed is None else timed, about),
         _picture(page, "runtime", "Run time per step over the number of proposals"),
         *([] if precision is None else [_precision(precision)]),
         kept,
@@ -205,12 +210,13 @@ def _metrics(panels: Sequence[Panel]) -> str:
     return "\n".join(parts)
 
 
-def _runtime(panels: Sequence[Panel], about: Mapping[str, Any]) -> str:
-    runs = list({id(panel.run): panel.run for panel in panels}.values())
-    devices = ", ".join(_every(runs, "device"))
+def _runtime(panels: Sequence[Panel], timed: Sequence[Run], about: Mapping[str, Any]) -> str:
+    devices = ", ".join(_every(timed, "device"))
+    counts = {panel.suite: panel.timed for panel in panels}
     text = (
         "Wall time of a drive over its steps, ms: planner, traffic, vehicle and metrics, without "
-        "compilation. All rows of a suite took turns on the same scenarios, on "
+        "compilation. All rows of a suite took turns on the same scenarios ("
+        f"{', '.join(f'{count} of {suite}' for suite, count in counts.items())}), on "
         f"{devices}; {'; '.join(about['machines'])}; as many scenarios at a time as there are "
         "cores.\n"
     )
