@@ -122,7 +122,7 @@ def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Ite
             settings = {
                 **dict.fromkeys(_SETTINGS),
                 "prediction": prediction,
-                "weights": f"{weights.model} {weights.digest}",
+                "weights": f"{weights.model} {weights.digest[:8]}",
             }
             learned = drivers.learned_planner(planner, weights, prediction)
             config, arrays = PlannerConfig(), weights.arrays

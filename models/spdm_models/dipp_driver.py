@@ -1,5 +1,6 @@
 """DIPP with its own network in the closed loop."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax
@@ -9,7 +10,7 @@ from spdm_jax.agents.forecast import React
 from spdm_jax.config import NUM_TRAJECTORY_STATES, PlannerParams
 from spdm_jax.planner import StepInput
 from spdm_jax.simulation.drivers import Driven, Driver
-from spdm_jax.types import Scenario
+from spdm_jax.types import ProposalSet, Scenario
 
 from . import dipp
 from .dipp import DIPPConfig
@@ -18,7 +19,7 @@ from .dipp_on_gameformer import DIPPRefinerConfig
 from .dipp_planner import TEST_SOLVER, DIPPPlannerConfig, bicycle, problem_from_features, solve
 from .gameformer_planner import own_center_path
 from .params import Params
-from .plan_frame import continued, plan_in_scene
+from .plan_frame import continued, plan_in_scene, proposals_in_scene
 from .predictions import Prediction, futures_of
 from .scene_features import FeatureConfig, History, recorded_history
 from .sight import look
@@ -65,8 +66,6 @@ def dipp_driver(params: Params, config: DIPPDriverConfig) -> Driver:
         of the program.
       config: static settings.
     """
-    count, problem_config = config.inputs.neighbors, config.refiner.problem
-    steps = problem_config.horizon
 
     def step(
         scene: Scenario,
@@ -75,40 +74,76 @@ def dipp_driver(params: Params, config: DIPPDriverConfig) -> Driver:
         state: History,
         react: React | None = None,
     ) -> Driven:
-        ego, vehicle = given.ego, PlannerParams().vehicle
-        sight = look(scene, given, state, config.features)
-        inputs = dipp_features(
-            scene.map, given.observation.lights, ego, sight.features, vehicle, config.inputs
-        )
-        output = dipp.apply(params, config.network, inputs)
-        best = jnp.argmax(output.scores)
-        controls = output.controls[best]
-        zero = jnp.zeros_like(ego.x)
-
-        def driven(controls):
-            limit = problem_config.max_steering
-            speed = jnp.hypot(ego.vx, ego.vy)
-            motion = bicycle(controls, zero, zero, zero, speed, max_steering=limit)
-            return jnp.stack([motion.x, motion.y, motion.heading], axis=-1)
-
-        beside = futures_of(config.prediction, scene, given, sight.neighbors, count, steps, react)
-        first = driven(controls)
-        futures = output.predictions[best] if beside is None else beside(first[None])[0]
-        center, found = own_center_path(scene, given, config.refiner)
-        # The curvature column is not read.
-        rows = (center.path, jnp.zeros_like(center.info)[:, None], center.info[:, None])
-        problem = problem_from_features(
-            inputs.ego[-1],
-            inputs.neighbors[:, -1],
-            futures,
-            jnp.concatenate(rows, axis=-1),
-            output.cost_weights,
-        )
-        solution = solve(controls, problem, config.refiner.solver, problem_config)
-        refined = driven(solution.values.reshape(steps, 2))
-        poses = continued(jnp.where(found, refined, first), NUM_TRAJECTORY_STATES - 1)
-        plan = plan_in_scene(poses, ego, time)
-        return Driven(plan, sight.history, found & center.overflow)
+        modes, best, history, overflow = _refine(params, scene, given, state, config, react)
+        poses = continued(modes(best), NUM_TRAJECTORY_STATES - 1)
+        return Driven(plan_in_scene(poses, given.ego, time), history, overflow)
 
     init = lambda scene: recorded_history(scene, -1)
     return Driver("DIPP", init, step, step if config.prediction == "perfect" else None)
+
+
+def dipp_proposals(
+    params: Params,
+    scene: Scenario,
+    given: StepInput,
+    history: History,
+    config: DIPPDriverConfig,
+    react: React | None = None,
+) -> tuple[ProposalSet, History, jax.Array]:
+    """The network's M joint futures, each refined, as proposals for the PDM scorer.
+
+    Args:
+      params: weights of the network.
+      scene: one scenario.
+      given: ego and objects of this step.
+      history: up to the step before.
+      config: static settings.
+      react: how traffic would react, in traffic that does.
+
+    Returns:
+      Proposals `[M, 41]` in the scene's frame, the history for the next step, and whether a fixed
+      buffer was too small, `[]` bool.
+    """
+    modes, _, following, overflow = _refine(params, scene, given, history, config, react)
+    poses = jax.vmap(modes)(jnp.arange(config.network.modes))
+    return proposals_in_scene(poses, given.ego), following, overflow
+
+
+def _refine(
+    params: Params,
+    scene: Scenario,
+    given: StepInput,
+    before: History,
+    config: DIPPDriverConfig,
+    react: React | None,
+) -> tuple[Callable[[jax.Array], jax.Array], jax.Array, History, jax.Array]:
+    """Returns what refines a mode `[]` to poses `[T, 3]`, the best mode, history and overflow."""
+    ego, vehicle, problem_config = given.ego, PlannerParams().vehicle, config.refiner.problem
+    steps, count = problem_config.horizon, config.inputs.neighbors
+    sight = look(scene, given, before, config.features)
+    inputs = dipp_features(
+        scene.map, given.observation.lights, ego, sight.features, vehicle, config.inputs
+    )
+    output = dipp.apply(params, config.network, inputs)
+    beside = futures_of(config.prediction, scene, given, sight.neighbors, count, steps, react)
+    center, found = own_center_path(scene, given, config.refiner)
+    # The curvature column is not read.
+    rows = (center.path, jnp.zeros_like(center.info)[:, None], center.info[:, None])
+    ref_line = jnp.concatenate(rows, axis=-1)
+
+    def driven(controls: jax.Array) -> jax.Array:
+        zero = jnp.zeros_like(ego.x)
+        speed, limit = jnp.hypot(ego.vx, ego.vy), problem_config.max_steering
+        motion = bicycle(controls, zero, zero, zero, speed, max_steering=limit)
+        return jnp.stack([motion.x, motion.y, motion.heading], axis=-1)
+
+    def refined(mode: jax.Array) -> jax.Array:
+        controls = output.controls[mode]
+        first = driven(controls)
+        futures = output.predictions[mode] if beside is None else beside(first[None])[0]
+        ego_now, others = inputs.ego[-1], inputs.neighbors[:, -1]
+        problem = problem_from_features(ego_now, others, futures, ref_line, output.cost_weights)
+        solution = solve(controls, problem, config.refiner.solver, problem_config)
+        return jnp.where(found, driven(solution.values.reshape(steps, 2)), first)
+
+    return refined, jnp.argmax(output.scores), sight.history, found & center.overflow

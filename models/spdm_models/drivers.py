@@ -30,7 +30,7 @@ from .weights import Config, ModelName, load_weights
 LearnedName = Literal["gameformer", "gameformer-path", "gameformer-dipp", "dipp", "dtpp"]
 TITLES: Mapping[LearnedName, str] = {
     "gameformer": "GameFormer",
-    "gameformer-path": "GameFormer, speeds refined along a path",
+    "gameformer-path": "GameFormer + path",
     "gameformer-dipp": "GameFormer + DIPP",
     "dipp": "DIPP",
     "dtpp": "DTPP",

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from spdm_jax.agents.forecast import React
 from spdm_jax.planner import StepInput
 from spdm_jax.simulation.drivers import Driven, Driver
-from spdm_jax.types import Scenario
+from spdm_jax.types import ProposalSet, Scenario
 
 from .dtpp_planner import DTPPPlannerConfig, plan, scene_paths
+from .dtpp_tree import TreePlan
 from .params import Params
-from .plan_frame import plan_in_scene
+from .plan_frame import plan_in_scene, proposals_in_scene
 from .predictions import Prediction, futures_of
 from .scene_features import FeatureConfig, History, recorded_history
 from .sight import look
@@ -49,13 +50,6 @@ def dtpp_driver(params: Params, config: DTPPDriverConfig) -> Driver:
         of the program.
       config: static settings.
     """
-    count = config.planner.network.neighbors
-
-    tree = config.planner.tree
-    steps = tree.first_steps + tree.second_steps
-
-    def init(scene: Scenario) -> History:
-        return recorded_history(scene, -1)
 
     def step(
         scene: Scenario,
@@ -64,21 +58,64 @@ def dtpp_driver(params: Params, config: DTPPDriverConfig) -> Driver:
         state: History,
         react: React | None = None,
     ) -> Driven:
-        ego = given.ego
-        sight = look(scene, given, state, config.features)
-        found = scene_paths(scene.map, scene.route, ego, given.observation, config.planner)
-        beside = futures_of(config.prediction, scene, given, sight.neighbors, count, steps, react)
-        chosen = plan(
-            params,
-            sight.features,
-            found.paths,
-            ego.vx,
-            ego.ax,
-            found.limit,
-            config.planner,
-            futures=beside,
-        )
-        poses = jnp.stack([chosen.x, chosen.y, chosen.heading], axis=-1)
-        return Driven(plan_in_scene(poses, ego, time), sight.history, found.overflow)
+        tree, history, overflow = _search(params, scene, given, state, config, react)
+        poses = jnp.stack([tree.x, tree.y, tree.heading], axis=-1)
+        return Driven(plan_in_scene(poses, given.ego, time), history, overflow)
 
+    init = lambda scene: recorded_history(scene, -1)
     return Driver("DTPP", init, step, step if config.prediction == "perfect" else None)
+
+
+def dtpp_proposals(
+    params: Params,
+    scene: Scenario,
+    given: StepInput,
+    history: History,
+    config: DTPPDriverConfig,
+    react: React | None = None,
+) -> tuple[ProposalSet, History, jax.Array]:
+    """The branches of the second stage as proposals for the PDM scorer.
+
+    Args:
+      params: weights of the network, which decides what is expanded.
+      scene: one scenario.
+      given: ego and objects of this step.
+      history: up to the step before.
+      config: static settings.
+      react: how traffic would react, in traffic that does.
+
+    Returns:
+      Proposals `[N, 41]` in the scene's frame, the history for the next step, and whether a fixed
+      buffer was too small, `[]` bool.
+    """
+    tree, following, overflow = _search(params, scene, given, history, config, react)
+    branches = tree.second
+    proposals = proposals_in_scene(branches.states[..., :3], given.ego, branches.valid)
+    return proposals, following, overflow
+
+
+def _search(
+    params: Params,
+    scene: Scenario,
+    given: StepInput,
+    before: History,
+    config: DTPPDriverConfig,
+    react: React | None,
+) -> tuple[TreePlan, History, jax.Array]:
+    planner, ego = config.planner, given.ego
+    sight = look(scene, given, before, config.features)
+    found = scene_paths(scene.map, scene.route, ego, given.observation, planner)
+    count = planner.network.neighbors
+    steps = planner.tree.first_steps + planner.tree.second_steps
+    beside = futures_of(config.prediction, scene, given, sight.neighbors, count, steps, react)
+    tree = plan(
+        params,
+        sight.features,
+        found.paths,
+        ego.vx,
+        ego.ax,
+        found.limit,
+        planner,
+        futures=beside,
+    )
+    return tree, sight.history, found.overflow

@@ -1,17 +1,15 @@
 """GameFormer, alone and with a refinement, in the closed loop."""
 
 import jax
-import jax.numpy as jnp
 
 from spdm_jax.agents.forecast import React
-from spdm_jax.config import NUM_STATES
 from spdm_jax.planner import StepInput
 from spdm_jax.simulation.drivers import Driven, Driver
 from spdm_jax.types import ProposalSet, Scenario
 
 from .gameformer_planner import GameFormerPlannerConfig, ego_modes, finish, predict
 from .params import Params
-from .plan_frame import in_scene, plan_in_scene
+from .plan_frame import plan_in_scene, proposals_in_scene
 from .scene_features import History, recorded_history
 from .sight import look
 
@@ -74,24 +72,4 @@ def gameformer_proposals(
     predicted = predict(params, scene, given, sight, config, react)
     modes = ego_modes(predicted)
     done = finish(modes, predicted, cost_weights, scene, given, sight, config)
-    x, y, heading = (v[:, :NUM_STATES] for v in in_scene(done.poses, given.ego))
-    return as_proposals(x, y, heading), sight.history, done.overflow
-
-
-def as_proposals(x: jax.Array, y: jax.Array, heading: jax.Array) -> ProposalSet:
-    """Poses `[M, T]` as proposals of stage 2 without a lane; those that are not finite are not
-    valid."""
-    valid = jnp.all(jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(heading), axis=1)
-    keep = lambda values: jnp.where(valid[:, None], values, 0)
-    count = x.shape[0]
-    index = jnp.arange(count, dtype=jnp.int32)
-    return ProposalSet(
-        x=keep(x),
-        y=keep(y),
-        heading=keep(heading),
-        valid=valid,
-        path=index,
-        policy=jnp.zeros_like(index),
-        stage=jnp.full_like(index, 2),
-        lane=jnp.full_like(index, -1),
-    )
+    return proposals_in_scene(done.poses, given.ego), sight.history, done.overflow

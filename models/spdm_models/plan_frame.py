@@ -1,12 +1,12 @@
-"""Plans of the ego frame as the simulation takes them."""
+"""Plans of the ego frame as the simulation and the PDM scorer take them."""
 
 import jax
 import jax.numpy as jnp
 
-from spdm_jax.config import DT
+from spdm_jax.config import DT, NUM_STATES
 from spdm_jax.geometry import wrap
 from spdm_jax.simulation.controller import Plan
-from spdm_jax.types import EgoState
+from spdm_jax.types import EgoState, ProposalSet
 
 
 def in_scene(poses: jax.Array, ego: EgoState) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -34,6 +34,33 @@ def plan_in_scene(poses: jax.Array, ego: EgoState, time: jax.Array) -> Plan:
     x, y, heading = in_scene(poses, ego)
     return Plan(
         x=x, y=y, heading=heading, time=jnp.arange(x.shape[0], dtype=x.dtype) * DT, start=time
+    )
+
+
+def proposals_in_scene(
+    poses: jax.Array, ego: EgoState, valid: jax.Array | None = None
+) -> ProposalSet:
+    """Returns plans `[M, T, 3]` of the ego frame as proposals `[M, 41]` of stage 2 without a lane.
+
+    Args:
+      poses: as in `in_scene`, 40 steps or more.
+      ego: current state, scalars.
+      valid: `[M]` bool, real ones; a plan that is not finite is none in any case.
+    """
+    x, y, heading = (values[:, :NUM_STATES] for values in in_scene(poses, ego))
+    real = jnp.all(jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(heading), axis=1)
+    real = real if valid is None else real & valid
+    keep = lambda values, now: jnp.where(real[:, None], values, now)
+    index = jnp.arange(x.shape[0], dtype=jnp.int32)
+    return ProposalSet(
+        x=keep(x, ego.x),
+        y=keep(y, ego.y),
+        heading=keep(heading, ego.heading),
+        valid=real,
+        path=index,
+        policy=jnp.zeros_like(index),
+        stage=jnp.full_like(index, 2),
+        lane=jnp.full_like(index, -1),
     )
 
 

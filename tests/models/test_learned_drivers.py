@@ -14,12 +14,15 @@ import pytest
 from small_road import EGO_X, LANE_WIDTH, Thing, observe, road, scene_of
 from spdm_jax import functional
 from spdm_jax.config import NUM_STATES, PlannerParams
+from spdm_jax.planner import StepInput
 from spdm_jax.simulation.loop import Run, SimulationConfig, SimulationParams, simulate
 from spdm_jax.types import Scenario
 from spdm_models import dipp, dtpp, gameformer
 from spdm_models.checkpoint import read_checkpoint, read_metadata, write_checkpoint
 from spdm_models.dipp import DIPPConfig
+from spdm_models.dipp_driver import DIPPDriverConfig, dipp_proposals
 from spdm_models.dipp_on_gameformer import DIPPRefinerConfig, even_weights
+from spdm_models.dipp_planner import DIPPPlannerConfig
 from spdm_models.drivers import (
     LearnedName,
     LearnedPlanner,
@@ -29,13 +32,16 @@ from spdm_models.drivers import (
     read_weights,
 )
 from spdm_models.dtpp import DTPPConfig
+from spdm_models.dtpp_driver import DTPPDriverConfig, dtpp_proposals
+from spdm_models.dtpp_planner import DTPPPlannerConfig
 from spdm_models.gameformer import GameFormerConfig
 from spdm_models.gameformer_driver import gameformer_proposals
 from spdm_models.gameformer_planner import GameFormerPlannerConfig
 from spdm_models.gauss_newton import GaussNewtonConfig
 from spdm_models.predictions import Prediction
+from spdm_models.route_lines import RouteLineConfig
 from spdm_models.scene_encoder import EncoderConfig
-from spdm_models.scene_features import recorded_history
+from spdm_models.scene_features import History, recorded_history
 from spdm_models.weights import save_weights
 
 ENCODER = EncoderConfig(width=16, heads=8, layers=1)
@@ -192,30 +198,39 @@ def test_perfect_predictions_in_reactive_traffic(scenes, files, file, name):
 
 
 @pytest.mark.slow
-def test_modes_are_proposals_that_the_scorer_takes(scenes, files):
-    weights = read_weights(files["gameformer"], "gameformer")
-    assert isinstance(weights.network, GameFormerConfig)
+@pytest.mark.parametrize("name", ["gameformer", "dipp", "dtpp"])
+def test_candidates_are_proposals_that_the_scorer_takes(scenes, files, name):
+    weights = read_weights(files[name], name)
     solver = GaussNewtonConfig(iterations=3, step_size=0.4, result="best")
-    config = GameFormerPlannerConfig(
-        network=weights.network,
-        refinement="dipp",
-        dipp=DIPPRefinerConfig(solver=solver, max_path_points=512),
-    )
+    lines = RouteLineConfig(max_path_points=512)
+
+    def candidates(arrays: Any, scene: Scenario, given: StepInput, history: History):
+        step = (scene, given, history)
+        params, network = arrays["network"], weights.network
+        if isinstance(network, GameFormerConfig):
+            refiner = DIPPRefinerConfig(solver=solver, max_path_points=512)
+            config = GameFormerPlannerConfig(network=network, refinement="dipp", dipp=refiner)
+            return gameformer_proposals(params, arrays["cost_weights"], *step, config)
+        if isinstance(network, DIPPConfig):
+            refiner = DIPPRefinerConfig(DIPPPlannerConfig(), solver, max_path_points=512)
+            return dipp_proposals(params, *step, DIPPDriverConfig(network, refiner=refiner))
+        assert isinstance(network, DTPPConfig)
+        planner = DTPPPlannerConfig(network, lines=lines)
+        return dtpp_proposals(params, *step, DTPPDriverConfig(planner))
 
     @jax.jit
     def propose(scene: Scenario, arrays: Any):
         given, history = observe(scene, 0), recorded_history(scene, -1)
-        found, _, overflow = gameformer_proposals(
-            arrays["network"], arrays["cost_weights"], scene, given, history, config
-        )
+        found, _, overflow = candidates(arrays, scene, given, history)
         params = PlannerParams()
         poses = found.x, found.y, found.heading
         tracked, _ = functional.track(*poses, given.ego, params.vehicle, params.tracker)
         return found, overflow, tracked
 
     found, overflow, tracked = propose(scenes["lead"], weights.arrays)
-    assert not overflow and found.x.shape == (weights.network.modes, NUM_STATES)
-    assert np.all(found.valid)
+    count = {"gameformer": 2, "dipp": 3, "dtpp": 30}[name]
+    assert not overflow and found.x.shape == (count, NUM_STATES)
+    assert np.all(found.valid) if name != "dtpp" else 5 <= np.sum(found.valid)
     np.testing.assert_allclose(found.x[:, 0], float(observe(scenes["lead"], 0).ego.x), rtol=1e-6)
     assert np.isfinite(tracked.x).all()
 
