@@ -139,7 +139,7 @@ def _score(
     profile: Profile,
     params: ScoringParams | None,
 ) -> NavsimScores:
-    if profile.observation != "replay":
+    if (profile.observation, profile.areas, profile.progress_norm) != ("replay", "blocks", "pair"):
         raise ValueError(f"profile is {profile.name}; NAVSIM's frames need navsim1 or navsim2")
     params = ScoringParams() if params is None else params
     states, valid = _finite(states, finite, scene.ego)

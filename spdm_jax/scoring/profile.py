@@ -4,7 +4,7 @@ Every profile is a choice among the same sub-scores; the numbers they share (thr
 comfort bounds) stay in `ScoringParams`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from spdm_jax.config import NUM_STATES
@@ -140,9 +140,7 @@ NAVSIM2 = Profile(
 )
 """NAVSIM v2.2, one stage with recorded traffic: EPDMS."""
 
-NAVSIM2_UNFILTERED = Profile(
-    **{**vars(NAVSIM2), "name": "navsim2_unfiltered", "human_filter": False}
-)
+NAVSIM2_UNFILTERED = replace(NAVSIM2, name="navsim2_unfiltered", human_filter=False)
 """EPDMS without the human filter: the total that NAVSIM v2.0 to v2.1.2 reported."""
 
 PROFILES = {p.name: p for p in (TUPLAN, NAVSIM1, NAVSIM2, NAVSIM2_UNFILTERED)}

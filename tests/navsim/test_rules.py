@@ -21,9 +21,9 @@ from navsim_frame import (
 )
 from spdm_jax.navsim.batch import stack, to_device
 from spdm_jax.navsim.build import from_arrays
-from spdm_jax.navsim.score import score_trajectories
+from spdm_jax.navsim.score import score_states, score_trajectories
 from spdm_jax.navsim.types import NavsimScores
-from spdm_jax.scoring.profile import NAVSIM1, NAVSIM2, Profile
+from spdm_jax.scoring.profile import NAVSIM1, NAVSIM2, TUPLAN, Profile
 
 ROWS = 4  # trajectories of every call, so that there is one program per profile
 STATIC = 4  # a barrier
@@ -249,6 +249,12 @@ def test_nobody_is_held_to_what_the_human_failed():
     assert half.human.no_at_fault_collision == half.filtered.no_at_fault_collision[0] == 0.5
     assert half.filtered.time_to_collision[0] == 1
     assert score(hit, NAVSIM1).filtered.time_to_collision[0] == 0
+
+
+def test_frames_need_a_profile_of_navsim():
+    scene = to_device(from_arrays(frame()), jnp.float64)
+    with pytest.raises(ValueError, match="profile is tuplan"):
+        score_states(scene, jnp.zeros((1, STEPS, 11)), TUPLAN)
 
 
 def test_a_trajectory_that_is_not_finite_fails_alone():
