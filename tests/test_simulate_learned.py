@@ -11,7 +11,7 @@ import small_road as roads
 from small_road import Thing
 from spdm_experiments import cli, simulate_options
 from spdm_experiments.options import Simulate
-from spdm_experiments.simulate_points import NAMES, entries_of, make_points
+from spdm_experiments.simulate_points import NAMES, entries_of, make_points, weights_file
 from spdm_jax.io.build import build_scenario
 from spdm_jax.io.scenario_file import write_scenario
 from spdm_models import drivers, dtpp, gameformer
@@ -76,6 +76,16 @@ def test_points_of_learned_planners(weights: Path):
     # Runs without learned planners are described as they always were.
     plain = entries_of(make_points(Simulate(scenes=Path("packed"), planner=("pdm-closed",))))
     assert "prediction" not in plain[0] and "weights" not in plain[0]
+
+
+def test_a_folder_of_weights_is_one_of_files_or_of_trainings(weights: Path, tmp_path: Path):
+    file = weights / "dtpp.safetensors"
+    assert weights_file(file, "dtpp") == weights_file(weights, "dtpp") == file
+    assert weights_file(weights, "gameformer-path") == weights / "gameformer.safetensors"
+    trained = tmp_path / "dtpp" / "weights.safetensors"
+    trained.parent.mkdir()
+    trained.write_bytes(file.read_bytes())
+    assert weights_file(tmp_path, "dtpp") == trained
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,8 @@ class Simulate(OverGrid):
     """Where PDM-Closed and SPDM take the other agents' future from."""
     weights: Path | None = None
     """Weights of the learned planners (gameformer, gameformer-path, gameformer-dipp, dipp, dtpp): a
-    file of spdm train or spdm convert, or a folder with a file PLANNER.safetensors for each
-    (gameformer-path takes gameformer's)."""
+    file of spdm train or spdm convert, or a folder with PLANNER.safetensors, or the folder PLANNER
+    of spdm train, for each (gameformer-path takes gameformer's)."""
     prediction: tuple[Prediction, ...] = ()
     """What learned planners take for the other agents' future: their own predictions (learned, if
     left out), the record or how the agents would react (perfect), or nothing (none)."""

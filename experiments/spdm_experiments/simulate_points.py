@@ -149,10 +149,17 @@ def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Ite
         yield Point(planner, made.num_proposals, traffic, mode, settings, spec.config, spec.params)
 
 
-def _weights(given: Path, planner: LearnedName) -> Weights:
-    """Reads a planner's weights from the file, or from the folder's file of its name."""
+def weights_file(given: Path, planner: LearnedName) -> Path:
+    """Returns where a planner's weights are: the file itself, or the folder's file of its name."""
+    if not given.is_dir():
+        return given
     name = "gameformer" if planner == "gameformer-path" else planner
-    path = given / f"{name}.safetensors" if given.is_dir() else given
+    trained = given / name / "weights.safetensors"
+    return trained if trained.is_file() else given / f"{name}.safetensors"
+
+
+def _weights(given: Path, planner: LearnedName) -> Weights:
+    path = weights_file(given, planner)
     return _read(path, planner, path.stat().st_mtime_ns if path.is_file() else 0)
 
 

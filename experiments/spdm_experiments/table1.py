@@ -25,6 +25,7 @@ from spdm_experiments.closed_loop import (
 from spdm_experiments.options import Simulate
 from spdm_experiments.report_data import load_run
 from spdm_experiments.runtime import configure_jax
+from spdm_experiments.simulate_points import weights_file
 from spdm_experiments.table1_data import cells_of, frame_of
 from spdm_experiments.table1_lineup import COLUMNS, PLANNERS, Planner, learned, suite_of
 from spdm_experiments.table1_page import score_table, write_page
@@ -74,7 +75,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("step", nargs="?", choices=("run", "page"), default="run", help="what to do")
-    add("--weights", type=Path, help="folder with PLANNER.safetensors of each learned planner")
+    add("--weights", type=Path, help="folder with PLANNER.safetensors or PLANNER/")
     add("--out", type=Path, default=Path("out/table1"), help="run folders and table1.parquet")
     add("--planner", choices=PLANNERS, nargs="+", default=PLANNERS, help="these rows only")
     keys = tuple(column.key for column in COLUMNS)
@@ -127,9 +128,9 @@ def _note_weights(out: Path, folder: Path | None, planners: Sequence[Planner]) -
     facts: dict[str, Any] = {}
     for name in learned(planners):
         assert folder is not None
-        weights = read_weights(folder / f"{name}.safetensors", name)
+        weights = read_weights(weights_file(folder, name), name)
         facts[name] = {
-            "file": weights.path.name,
+            "file": str(weights.path.relative_to(folder)),
             "digest": weights.digest,
             "model": weights.model,
             "sizes": weights.sizes,

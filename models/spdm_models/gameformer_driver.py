@@ -1,6 +1,7 @@
 """GameFormer, alone and with a refinement, in the closed loop."""
 
 import jax
+import jax.numpy as jnp
 
 from spdm_jax.agents.forecast import React
 from spdm_jax.planner import StepInput
@@ -36,9 +37,9 @@ def gameformer_driver(
     ) -> Driven:
         sight = look(scene, given, state, config.features)
         predicted = predict(params, scene, given, sight, config, react)
-        plan = predicted.output.plan[None]
+        plan = predicted.output.plan
         done = finish(plan, predicted, cost_weights, scene, given, sight, config)
-        return Driven(plan_in_scene(done.poses[0], given.ego, time), sight.history, done.overflow)
+        return Driven(plan_in_scene(done.poses, given.ego, time), sight.history, done.overflow)
 
     init = lambda scene: recorded_history(scene, -1)
     return Driver(name, init, step, step if config.prediction == "perfect" else None)
@@ -70,6 +71,6 @@ def gameformer_proposals(
     """
     sight = look(scene, given, history, config.features)
     predicted = predict(params, scene, given, sight, config, react)
-    modes = ego_modes(predicted)
-    done = finish(modes, predicted, cost_weights, scene, given, sight, config)
-    return proposals_in_scene(done.poses, given.ego), sight.history, done.overflow
+    refined = lambda mode: finish(mode, predicted, cost_weights, scene, given, sight, config)
+    done = jax.vmap(refined)(ego_modes(predicted))
+    return proposals_in_scene(done.poses, given.ego), sight.history, jnp.any(done.overflow)

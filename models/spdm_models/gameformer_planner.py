@@ -73,10 +73,10 @@ class Predicted(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """Plans of the ego.
+    """A plan of the ego.
 
     Attributes:
-      poses: `[..., T, 3]` x, y, heading in the ego frame, first at 0.1 s.
+      poses: `[T, 3]` x, y, heading in the ego frame, first at 0.1 s.
       overflow: `[]` bool, a fixed buffer was too small.
     """
 
@@ -123,7 +123,7 @@ def predict(
 
 
 def finish(
-    plans: jax.Array,
+    plan: jax.Array,
     predicted: Predicted,
     cost_weights: jax.Array,
     scene: Scenario,
@@ -131,12 +131,12 @@ def finish(
     sight: Sight,
     config: GameFormerPlannerConfig,
 ) -> Finished:
-    """Refines plans `[M, T, 3]` of the ego frame as the config asks.
+    """Refines a plan as the config asks; `vmap` over `plan` refines several.
 
-    Off the route, where there is no line to follow, they stay as they are.
+    Off the route, where there is no line to follow, it stays as it is.
 
     Args:
-      plans: of the network.
+      plan: `[T, 3]` of the ego frame, of the network.
       predicted: of `predict`.
       cost_weights: `[9]` of DIPP's problem.
       scene: one scenario.
@@ -145,39 +145,29 @@ def finish(
       config: static settings.
     """
     if config.refinement == "none":
-        return Finished(plans, jnp.bool_(False))
+        return Finished(plan, jnp.bool_(False))
     if config.refinement == "dipp":
-        return _by_dipp(plans, predicted, cost_weights, scene, given, sight, config)
-    reference, overflow = scene_reference(scene, given, config.lines)
-    last = predicted.output.levels[-1]
-    futures = jnp.broadcast_to(
-        predicted.futures[:, None], (*last.scores[1:].shape, *predicted.futures.shape[1:])
-    )
-    now = sight.features.neighbors_past[: config.network.neighbors, -1]
-    cells = occupancy(futures, last.scores[1:], now, reference)
-    ego = given.ego
-    refined = jax.vmap(lambda plan: refine(plan, ego.vx, ego.ax, reference, cells))(plans)
-    return Finished(refined.poses, overflow)
-
-
-def _by_dipp(plans, predicted, cost_weights, scene, given, sight, config) -> Finished:
-    center, found = own_center_path(scene, given, config.dipp)
-    past, neighbors = sight.features.ego_past, sight.features.neighbors_past
-
-    def one(plan):
+        center, found = own_center_path(scene, given, config.dipp)
         refined = refine_plan(
             plan,
             predicted.futures,
-            past,
-            neighbors,
+            sight.features.ego_past,
+            sight.features.neighbors_past,
             center,
             cost_weights,
             config.dipp,
             PlannerParams().vehicle,
         )
-        return jnp.where(found, refined.poses, plan)
-
-    return Finished(jax.vmap(one)(plans), found & center.overflow)
+        return Finished(jnp.where(found, refined.poses, plan), found & center.overflow)
+    reference, overflow = scene_reference(scene, given, config.lines)
+    scores = predicted.output.levels[-1].scores[1:]
+    futures = jnp.broadcast_to(
+        predicted.futures[:, None], (*scores.shape, *predicted.futures.shape[1:])
+    )
+    now = sight.features.neighbors_past[: config.network.neighbors, -1]
+    cells = occupancy(futures, scores, now, reference)
+    poses = refine(plan, given.ego.vx, given.ego.ax, reference, cells).poses
+    return Finished(poses, overflow)
 
 
 def own_center_path(

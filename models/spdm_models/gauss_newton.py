@@ -19,7 +19,7 @@ class GaussNewtonConfig:
     """Static settings of a solve.
 
     Attributes:
-      iterations: number of steps that are computed, whatever happens.
+      iterations: number of steps at most.
       step_size: part of the Gauss-Newton step that is taken.
       absolute_tolerance: a solve stands still once a step changes the objective by less.
       relative_tolerance: the same, relative to the objective before the step.
@@ -98,8 +98,8 @@ def gauss_newton(
 ) -> GaussNewtonSolution:
     """Minimises half the sum of squared residuals: u <- u - step_size (J^T J)^-1 J^T r.
 
-    No damping and no line search; all iterations are computed and a converged solve stands still,
-    so a batch under `vmap` runs one program of known cost.
+    No damping and no line search. A converged solve stands still; under `vmap` all iterations are
+    computed, so that a batch runs one program of known cost.
 
     Args:
       residual: `[V]` to `[R]` weighted residuals, R >= V.
@@ -122,13 +122,17 @@ def gauss_newton(
             converged=small,
         )
 
-    def iterate(state: _Search, _):
+    def move(state: _Search) -> tuple[_Search, jax.Array]:
         # The linearisation tells the objective too: what the last step led to is judged here.
         step, error = gauss_newton_step(residual, state.values)
         state = judge(state, error)
         moved = state.values + config.step_size * step
         values = jnp.where(state.converged, state.values, moved)
         return state._replace(values=values), error
+
+    def iterate(state: _Search, _):
+        # Alone a converged solve costs nothing more; under vmap both sides are computed.
+        return jax.lax.cond(state.converged, lambda s: (s, s.error), move, state)
 
     unknown = jnp.full((), jnp.inf, start.dtype)
     state = _Search(start, unknown, start, unknown, jnp.asarray(False))
