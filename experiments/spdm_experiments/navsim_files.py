@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from spdm_experiments.inventory import Entry, Inventory, take_inventory
-from spdm_jax import Failure, NavsimSet, ScenarioSet, load, load_navsim, to_navsim
+from spdm_jax import Failure, NavsimSet, load, load_navsim, to_navsim
 from spdm_jax.batching import Precision
 from spdm_jax.io.raw import ScenarioError
 from spdm_jax.navsim.frames import lack
 from spdm_jax.navsim.reader import describe_export, is_export
+from spdm_jax.padding import AXES, PaddingConfig, bucket
 from spdm_jax.scoring.profile import Profile
 
 FOREIGN = ("tracker", "forecast", "progress_reference")
@@ -96,17 +97,45 @@ def _entry(path: Path, token: str, log_name: str, source: str) -> Entry:
     )
 
 
-def load_frames(entries: Sequence[Entry], profile: Profile, precision: Precision) -> NavsimSet:
-    """Makes frames of files; one that cannot be used is a failure, not an error."""
+def common_padding(entries: Sequence[Entry]) -> PaddingConfig | None:
+    """Returns one size per axis that holds all scenarios, so that one program plans them all.
+
+    Exported frames have no such sizes: None.
+    """
+    if not entries[0].sizes:
+        return None
+    largest = {axis: max(entry.sizes[axis] for entry in entries) for axis in AXES}
+    rooms = PaddingConfig()
+    return PaddingConfig(
+        **{axis: (bucket(size, getattr(rooms, axis)),) for axis, size in largest.items()}
+    )
+
+
+def load_frames(
+    entries: Sequence[Entry],
+    profile: Profile,
+    precision: Precision,
+    padding: PaddingConfig | None,
+) -> NavsimSet:
+    """Makes frames of files; one that cannot be used is a failure, not an error.
+
+    Args:
+      entries: files.
+      profile: that they are to serve.
+      precision: of PDM-Closed, where the files are scenarios.
+      padding: of scenarios, see `common_padding`.
+    """
     paths = [entry.path for entry in entries]
     try:
         if entries[0].source.startswith("NAVSIM"):
             found = load_navsim(paths)
         else:
-            scenarios: ScenarioSet = load(paths)
-            found = to_navsim(scenarios, precision=precision)
-    except ValueError as error:  # none of them
-        return NavsimSet([], [], [Failure(entry.token, str(error)) for entry in entries])
+            found = to_navsim(load(paths, padding=padding), precision=precision)
+    except ValueError as error:  # none of them: each has its own reason
+        if len(entries) == 1:
+            return NavsimSet([], [], [Failure(entries[0].token, str(error))])
+        alone = [load_frames([entry], profile, precision, padding) for entry in entries]
+        return NavsimSet([], [], [failure for part in alone for failure in part.failures])
     # Failures know the file's name only.
     tokens = {entry.path.stem: entry.token for entry in entries}
     found.failures[:] = [Failure(tokens.get(f.token, f.token), f.reason) for f in found.failures]

@@ -10,7 +10,12 @@ from spdm_experiments.inventory import Entry, Inventory, Shard, split
 from spdm_experiments.label import DTYPES, stored_vocabulary
 from spdm_experiments.label_folder import FORMAT, clean, digest, open_folder, read_done, write_part
 from spdm_experiments.label_work import index_row
-from spdm_experiments.navsim_files import frame_inventory, load_frames, refuse_foreign
+from spdm_experiments.navsim_files import (
+    common_padding,
+    frame_inventory,
+    load_frames,
+    refuse_foreign,
+)
 from spdm_experiments.options import Label
 from spdm_experiments.parts import part_name
 from spdm_experiments.record import REASONS
@@ -144,11 +149,12 @@ class NavsimLabelRun(Verb):
     def run(self, shard: Shard, missing: set[str], stop: Callable[[], bool]) -> Iterator[Done]:
         """See `Verb`."""
         entries = [entry for entry in self._inventory.entries if entry.token in missing]
+        padding = common_padding(self._inventory.entries)
+        load = lambda piece: load_frames(piece, self._profile, self._options.precision, padding)
         for rows in split(len(entries), self._options.chunk):
             mine, clock = [entries[i] for i in rows], Clock()
             labels, index = [self._none()], []
             pieces = [[mine[i] for i in piece] for piece in split(len(mine), PIECE)]
-            load = lambda piece: load_frames(piece, self._profile, self._options.precision)
             for frames in prefetch(load, pieces, threads=1):
                 index += self._failed(frames, mine)
                 if len(frames):

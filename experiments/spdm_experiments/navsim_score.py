@@ -9,6 +9,7 @@ from rich.table import Table
 from spdm_experiments.chunks import Survey, scenario_files, suite_name
 from spdm_experiments.inventory import Inventory, split
 from spdm_experiments.navsim_files import (
+    common_padding,
     frame_inventory,
     load_frames,
     read_previous,
@@ -80,7 +81,7 @@ def run_navsim_score(options: Score) -> bool:
     }
     record = Record(options.out, about, found.failures)
     table = _table(about["suite"], profile)
-    done = 0
+    done, padding = 0, common_padding(inventory.entries)
     with (
         stop_between_chunks() as stopping,
         progress_line("scoring", len(found.paths)) as advance,
@@ -90,7 +91,7 @@ def run_navsim_score(options: Score) -> bool:
                 break
             with clock.loading():
                 frames = load_frames(
-                    [inventory.entries[i] for i in rows], profile, options.precision
+                    [inventory.entries[i] for i in rows], profile, options.precision, padding
                 )
             record.failed |= {failure.token: failure.reason for failure in frames.failures}
             if len(frames):

@@ -47,7 +47,7 @@ class NavsimSet:
     frames: list[NavsimScene]
     infos: list[NavsimInfo]
     failures: list[Failure] = field(default_factory=list)
-    _stacked: NavsimScene | None = field(default=None, repr=False, compare=False)
+    _stacked: NavsimScene | None = field(default=None, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.infos)

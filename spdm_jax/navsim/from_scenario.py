@@ -48,10 +48,12 @@ class Way(NamedTuple):
 
 
 def plan_way(scene: Scenario, _: None, params: PlannerParams, config: PlannerConfig) -> Way:
-    """Plans at iteration 0 (pure).
+    """Plans at iteration 0 from what NAVSIM knows of the ego (pure).
 
     Source: NAVSIM `MetricCacheProcessor`.
     """
+    unmeasured = {name: jnp.zeros_like(scene.ego.x) for name in _UNMEASURED}
+    scene = scene.replace(ego=scene.ego.replace(**unmeasured))
     center = jax.tree.map(lambda v: v[0], planning.init(scene, params, config).paths)
     result = planning.plan(scene, params, config)
     pose = (result.proposals.x, result.proposals.y, result.proposals.heading)
@@ -124,9 +126,8 @@ def scenario_arrays(
     """
     now, vehicle = int(scene.num_history), VehicleParams()
     ahead = now + STEPS_PER_FRAME * np.arange(NUM_FRAMES)
-    known = lambda steps: np.array([0 <= s < len(scene.ego_valid) and scene.ego_valid[s]
-                                    for s in steps])  # fmt: skip
-    recorded, past = known(ahead), now + STEPS_PER_FRAME * np.arange(-PAST_FRAMES, 1)
+    past = now + STEPS_PER_FRAME * np.arange(-PAST_FRAMES, 1)
+    recorded = _known(scene, ahead)
     if not recorded[: NUM_POSES + 1].all():
         last = (int(np.argmin(recorded)) - 1) * 0.5
         raise ValueError(f"{info.token}: records {last:g} s after iteration 0; 4 s are needed")
@@ -147,13 +148,19 @@ def scenario_arrays(
         **_lights(scene, ahead[recorded]),
     }
     profiles = FIRST if recorded.all() else ()
-    if known(past).all():
+    if _known(scene, past).all():
         since = np.round(np.asarray(scene.time)[past] * 1e6).astype(np.int64)
         arrays["ego_past"] = _states(scene, past.tolist())
         arrays["ego_past_us"] = info.iteration0_time_us + since
         expect_plan(arrays)
         profiles += SECOND
     return arrays, profiles
+
+
+def _known(scene: Scenario, steps: np.ndarray) -> np.ndarray:
+    """Whether the ego is recorded at each step, `[K]` bool."""
+    inside = (steps >= 0) & (steps < len(scene.ego_valid))
+    return inside & np.asarray(scene.ego_valid)[np.where(inside, steps, 0)]
 
 
 def _states(scene: Scenario, steps: list[int]) -> np.ndarray:

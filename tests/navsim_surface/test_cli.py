@@ -11,6 +11,7 @@ import spdm_jax
 from navsim_stand_in import straight
 from spdm_experiments.cli import main
 from spdm_jax import NavsimSet, open_labels
+from spdm_jax.io.scenario_file import read_scenario, write_scenario
 from spdm_jax.navsim import navsim_export
 from spdm_jax.navsim.results import component
 
@@ -86,6 +87,46 @@ def test_broken_frame_is_a_failure(exported: Path, files: Path, capsys):
     assert rows.filter(token="torn")["status"].item() == "failed"
     assert run("label", *given, "--out", files / "labels") == 1
     assert "damaged" in open_labels(files / "labels").failures["torn"]
+
+
+def test_every_frame_that_cannot_be_built_has_its_own_reason(exported: Path, files: Path, capsys):
+    folder = files / "frames"
+    folder.mkdir()
+    with np.load(exported / "fast.npz") as stored:
+        arrays = dict(stored)
+    for token, name in (("a", "reference"), ("b", "ego_state")):
+        broken = {name: arrays[name] * np.nan, "token": np.array(token)}
+        navsim_export.write(folder / f"{token}.npz", {**arrays, **broken})
+    given = (folder, files / "drives.npy", "--profile", "navsim2")
+    assert run("score", *given, "--out", files / "out") == 1
+    text = capsys.readouterr().out
+    assert "a.npz: reference[0, 0] is nan" in text and "b.npz: ego_state[0] is nan" in text
+    assert run("label", *given, "--out", files / "labels") == 1
+    failures = open_labels(files / "labels").failures
+    assert "ego_state" in failures["b"] and "reference" in failures["a"]
+
+
+@pytest.mark.slow
+def test_scenario_files(files: Path, capsys):
+    packed = files / "packed"
+    assert main(["pack", "red_light,parked_car", str(packed)]) == 0
+    np.save(files / "fast.npy", straight(22.0, 0.0))
+    given = (packed, files / "fast.npy", "--profile", "navsim2")
+    assert run("score", *given, "--out", files / "out", "--chunk", 1) == 0
+    rows = polars.read_parquet(files / "out" / "rows.parquet")
+    assert rows.filter(token="red_light-0")["traffic_light"].to_list() == [0, 1]
+    assert run("label", *given, "--out", files / "labels", "--dtype", "f32") == 0
+    labels = open_labels(files / "labels")
+    for token in labels.tokens:
+        wanted = rows.filter(token=token)["total"].to_numpy()
+        np.testing.assert_allclose(labels[token][:, 0], wanted, rtol=0, atol=1e-5)
+    # One scenario whose record is too short is a failure; the other is scored.
+    path = packed / "parked_car-0.npz"
+    scene, info = read_scenario(path)
+    short = np.arange(len(scene.ego_valid)) < int(scene.num_history) + 30
+    write_scenario(path, scene.replace(ego_valid=scene.ego_valid & short), info)
+    assert run("score", *given, "--out", files / "out") == 1
+    assert "parked_car-0: records 2.5 s after iteration 0" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
