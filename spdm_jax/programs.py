@@ -98,7 +98,7 @@ def program(
                 call, _ = stored
             else:
                 with _not_kept_by_jax() as hits:
-                    call = lowered.compile()
+                    call = lowered.compile(compiler_options=_compiler_options(devices))
                 if twin and not hits:
                     _store(twin, call, used)
             if path and twin:
@@ -107,6 +107,15 @@ def program(
         made = Program(call, used, time.perf_counter() - started, bool(stored))
         _PROGRAMS[key] = made
         return made, True
+
+
+def _compiler_options(devices: Sequence[Any]) -> dict[str, Any]:
+    """Settings of XLA beside its own.
+
+    A GPU's autotuner compiles each of a planner's thousand small kernels several times to time
+    them: minutes, for kernels that wait for memory either way.
+    """
+    return {"xla_gpu_autotune_level": 0} if devices[0].platform == "gpu" else {}
 
 
 def _make_room() -> None:
