@@ -149,6 +149,12 @@ def test_v2_looks_for_collisions_to_come_up_to_3_1_s():
     assert second.ttc_index[0] == STEPS
     nearer = score(frame(logged(FRONT + 39.9 + 2.0)), NAVSIM2)
     assert nearer.ttc_index[0] == 31
+    # Gaining speed, the ego looks 54.1 m far at 3.1 s, 54.4 m at 3.4 s, and arrives at 54.6 m.
+    gaining = straight(10.0)
+    gaining[:, 0] += (0.5 * np.arange(1, 9)) ** 2
+    late = score(frame(logged(FRONT + 54.3 + 2.0)), NAVSIM2, gaining)
+    assert late.ttc_index[0] == STEPS
+    assert late.collision_index[0] == 40
 
 
 def test_blocks_and_intersections_are_drivable_and_lanes_are_not():
