@@ -184,6 +184,7 @@ def test_without_polars_the_losses_are_text(monkeypatch, tmp_path):
         (["--limit", "0"], "--limit is 0"),
         (["--per-type", "0"], "--per-type is 0"),
         (["--stride", "0"], "the stride is 0 steps"),
+        (["--precision", "bf16", "--size", "small"], "--precision bf16 needs --size full"),
         (["--steps", "0"], "--steps is 0"),
     ],
 )
@@ -210,8 +211,12 @@ def test_scenarios_without_a_future_are_told(scenes, tmp_path, capsys):
     assert not pack(Roads(1, known=60), short).failed
     files = [str(path) for path in sorted(scenes.glob("road-[1-8].npz"))]
     arguments = command(short, tmp_path / "out")
-    assert cli.main([*arguments[:3], *files, *arguments[3:]]) == 1
-    assert "road-0: no start time" in capsys.readouterr().out
+    assert cli.main([*arguments[:3], *files, *arguments[3:]]) == 0
+    assert "1 scenario without samples:\n  road-0: no start time" in capsys.readouterr().out
+    (short / "road-9.npz").write_bytes(b"damaged")
+    broken = command(short, tmp_path / "broken")
+    assert cli.main([*broken[:3], *files, *broken[3:]]) == 1
+    assert "1 scenario failed:\n  road-9: " in capsys.readouterr().out
 
 
 def test_a_suite_stands_for_scenes_that_are_not_tested_on(monkeypatch, tmp_path):

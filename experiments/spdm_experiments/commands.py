@@ -146,7 +146,7 @@ def simulate(options: Simulate) -> bool:
 
 
 def train(options: Train) -> bool:
-    """Trains a learned planner; False if a scenario gave nothing to learn from."""
+    """Trains a learned planner; False if a scenario could not be read."""
     from spdm_experiments.train import run_train
 
     return run_train(options)

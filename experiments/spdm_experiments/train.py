@@ -37,7 +37,7 @@ NOTED = ("versions", "commit", "device")
 
 
 def run_train(options: Train) -> bool:
-    """Trains a model; returns False if a scenario gave no samples.
+    """Trains a model; returns False if a scenario could not be read.
 
     Raises:
       ValueError: options or scenarios are of no use, the folder holds another training, or the
@@ -55,6 +55,9 @@ def run_train(options: Train) -> bool:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise ValueError(f"--{name} is {value}; it must be at least 1")
+    if options.precision == "bf16" and options.size == "small":
+        # Its heads are 6 wide, for which XLA has no bfloat16 product on GPUs.
+        raise ValueError("--precision bf16 needs --size full; leave it out for small networks")
     task = make_task(options.model, options.size, options.modes)
     inventory = find_scenes(options)
     began = time.perf_counter()
@@ -126,10 +129,12 @@ def run_train(options: Train) -> bool:
     save_weights(weights, task.model, task.config, task.network(fitted.params), training)
     print(_summary(fitted.log, per_epoch))
     print_files([weights, *written])
-    failed = {failure.token: failure.reason for failure in samples.failures}
-    if failed:
-        print("\n".join(["scenarios without samples:", *reasons(failed, options.out / RUN)]))
-    return not failed
+    for title, found in (("without samples", samples.unused), ("failed", samples.failures)):
+        if found:
+            lines = reasons({one.token: one.reason for one in found}, options.out / RUN)
+            number = f"{len(found)} scenario{'s' * (len(found) != 1)}"
+            print("\n".join([f"{number} {title}:", *lines]))
+    return not samples.failures
 
 
 def _write_log(folder: Path, log: Any) -> list[Path]:

@@ -44,7 +44,8 @@ class Train(OnDevice):
     every: int = 200
     """Steps between two checkpoints: what a kill can cost."""
     precision: Literal["f32", "bf16"] = "f32"
-    """Of matrix products; bf16 has an effect on GPUs only. Weights are float32."""
+    """Of matrix products; bf16 has an effect on GPUs only and needs --size full. Weights are
+    float32."""
     dropout: bool = True
     """Dropout during training."""
     stride: float = 1.0

@@ -45,12 +45,14 @@ class Samples:
     Attributes:
       train: to learn from.
       held_out: of other scenarios, to test on; None without any.
-      failures: scenarios that gave none, and why.
+      failures: scenarios that could not be read, and why.
+      unused: scenarios that have no sample, and why.
     """
 
     train: TrainSample
     held_out: TrainSample | None
     failures: list[Failure]
+    unused: list[Failure]
 
 
 def find_scenes(options: Train) -> Inventory:
@@ -98,11 +100,12 @@ def make_samples(inventory: Inventory, config: SampleConfig, options: Train) -> 
     stride = round(options.stride / DT)
     about = {"scenes": inventory.digest, "config": repr(config), "stride": stride}
     failures = list(inventory.failures)
+    unused: list[Failure] = []
     path = options.samples
     if path is not None and path.exists():
         samples, tokens = _read(path, about, config)
     else:
-        samples, tokens, failed = _compute(inventory.entries, config, stride)
+        samples, tokens, failed, unused = _compute(inventory.entries, config, stride)
         failures += failed
         if path is not None:
             _write(path, about, samples, tokens)
@@ -112,6 +115,7 @@ def make_samples(inventory: Inventory, config: SampleConfig, options: Train) -> 
         train=take(samples, np.flatnonzero(~kept)),
         held_out=take(samples, np.flatnonzero(kept)) if held else None,
         failures=failures,
+        unused=unused,
     )
 
 
@@ -124,7 +128,7 @@ def _held_out(tokens: Sequence[str], share: float) -> set[str]:
 
 def _compute(
     entries: Sequence[Entry], config: SampleConfig, stride: int
-) -> tuple[TrainSample, np.ndarray, list[Failure]]:
+) -> tuple[TrainSample, np.ndarray, list[Failure], list[Failure]]:
     maker = SampleMaker(config, stride)
     groups = group_by_shape([entry.sizes for entry in entries], waste=WASTE)
     jobs = [
@@ -135,6 +139,7 @@ def _compute(
     parts: list[TrainSample] = []
     tokens: list[np.ndarray] = []
     failures: list[Failure] = []
+    unused: list[Failure] = []
     done = 0
     with progress_line("samples", len(entries)) as advance:
         for scenes in prefetch(_load, jobs):
@@ -144,15 +149,14 @@ def _compute(
             tokens.append(names[rows])
             failures += scenes.failures
             lacking = sorted(set(names.tolist()) - set(names[rows].tolist()))
-            failures += [Failure(token, _lacking(config)) for token in lacking]
+            unused += [Failure(token, _lacking(config)) for token in lacking]
             done += len(names) + len(scenes.failures)
             advance(done)
     found = concatenate(parts)
     if count(found) == 0:
-        raise ValueError(
-            f"no scenario can be learnt from: {failures[0].token}: {failures[0].reason}"
-        )
-    return found, np.concatenate(tokens), failures
+        first = (unused or failures)[0]
+        raise ValueError(f"no scenario can be learnt from: {first.token}: {first.reason}")
+    return found, np.concatenate(tokens), failures, unused
 
 
 def _load(job: tuple[list[Path], PaddingConfig]):

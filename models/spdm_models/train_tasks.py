@@ -39,6 +39,8 @@ Loss = Callable[[Params, TrainSample, jax.Array | None, bool], tuple[jax.Array, 
 WIDTHS: dict[Size, int] = {"small": 48, "full": 256}
 """Of a token; the published networks have the full one."""
 CLIP_NORM = 5.0
+FIRST_STEPS = 30
+"""Steps of DTPP's first stage."""
 _LABELS = ("minADE", "minFDE", "planADE", "planFDE")
 
 
@@ -335,10 +337,6 @@ def dipp_task(config: DIPPConfig, planner_config: DIPPPlannerConfig | None = Non
         metrics=metrics,
         optimizer=lambda rate, params: optax.chain(clip_by_norm(CLIP_NORM), optax.adam(rate)),
     )
-
-
-FIRST_STEPS = 30
-"""Steps of DTPP's first stage."""
 
 
 def _plan_loss(plan: jax.Array, truth: jax.Array) -> jax.Array:

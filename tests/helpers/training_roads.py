@@ -1,6 +1,6 @@
 """Straight roads to learn from, and tasks so small that they compile fast."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from small_road import EGO_X, LANE_WIDTH, PADDING, Thing, road
 from spdm_jax import api
 from spdm_jax.io.raw import RawScenario
 from spdm_models.dipp import DIPPConfig
+from spdm_models.dipp_features import DIPPFeatureConfig
 from spdm_models.dtpp import DTPPConfig
 from spdm_models.gameformer import GameFormerConfig
 from spdm_models.scene_encoder import EncoderConfig
@@ -22,7 +23,9 @@ from spdm_models.train_tasks import (
 )
 
 ENCODER = EncoderConfig(width=32, heads=4, layers=1)
-GAMEFORMER = GameFormerConfig(encoder=ENCODER, levels=1, modes=3)
+NEIGHBORS = 3
+"""One more than a road has."""
+GAMEFORMER = GameFormerConfig(encoder=ENCODER, levels=1, modes=3, neighbors=NEIGHBORS)
 BATCH = 8
 
 
@@ -45,13 +48,15 @@ def raw_roads(number: int = 8) -> list[RawScenario]:
 def small_task(name: TaskName) -> Task:
     """A task with tiny widths."""
     if name == "dtpp":
-        return dtpp_task(DTPPConfig(encoder=ENCODER))
+        return dtpp_task(DTPPConfig(encoder=ENCODER, neighbors=NEIGHBORS))
     if name == "dipp":
-        return dipp_task(DIPPConfig(width=32))
+        task = dipp_task(DIPPConfig(width=32))
+        seen = DIPPFeatureConfig(neighbors=NEIGHBORS, lanes=2, crosswalks=1, points=20)
+        return replace(task, sample=replace(task.sample, count=NEIGHBORS, dipp=seen))
     if name == "gameformer-dipp":
         return refined_task(GAMEFORMER)
     if name == "gameformer-0":
-        return gameformer_task(dataclasses.replace(GAMEFORMER, levels=0))
+        return gameformer_task(replace(GAMEFORMER, levels=0))
     return gameformer_task(GAMEFORMER)
 
 

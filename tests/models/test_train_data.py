@@ -18,7 +18,7 @@ from spdm_models.train_data import (
     leaves_of,
     take,
 )
-from training_roads import raw_roads, road_samples, small_task
+from training_roads import NEIGHBORS, raw_roads, road_samples, small_task
 
 TASK = small_task("gameformer")
 
@@ -35,7 +35,7 @@ def test_every_scenario_gives_a_sample_per_stride(made):
     assert starts > STARTS_PER_CALL
     np.testing.assert_array_equal(np.bincount(rows), np.full(8, starts))
     assert count(samples) == 8 * starts
-    assert samples.ego.shape == (80, 80, 3) and samples.neighbors.shape == (80, 10, 80, 3)
+    assert samples.ego.shape == (80, 80, 3) and samples.neighbors.shape == (80, NEIGHBORS, 80, 3)
     assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(samples))
 
 
@@ -103,7 +103,10 @@ def test_trees_and_centre_lines_are_part_of_samples():
     assert np.all(ends[:, 0] < 4)
     assert np.all(ends[:, 0] <= np.where(real, ends, np.inf).min(axis=1) + 1e-5)
     lines, _ = road_samples(small_task("dipp"))
-    assert lines.ego.shape == (8, 50, 3) and lines.features.map_lanes.shape[1:3] == (11, 6)
+    assert lines.ego.shape == (8, 50, 3) and lines.features.map_lanes.shape[1:3] == (
+        1 + NEIGHBORS,
+        2,
+    )
     np.testing.assert_allclose(lines.path[:, 200, :2], 0, atol=0.06)
     np.testing.assert_allclose(lines.info, 13.4, rtol=1e-5)
     both, _ = road_samples(small_task("gameformer-dipp"))

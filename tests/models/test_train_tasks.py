@@ -15,7 +15,7 @@ from spdm_models.weights import load_weights, save_weights
 from training_roads import BATCH, road_samples, small_task
 
 SMOKE = FitConfig(steps=40, batch=BATCH, rate=3e-3, every=40)
-LONG = dataclasses.replace(SMOKE, steps=400, every=400, dropout=False)
+LONG = dataclasses.replace(SMOKE, rate=1e-3, steps=3000, every=3000, dropout=False)
 # By heart: mean and last error of plan and predictions, m.
 NEAR = {"minADE": 0.3, "minFDE": 0.6, "planADE": 0.3, "planFDE": 0.6}
 
