@@ -14,6 +14,8 @@ MARKS_MS = {
     "SPDM 60": ("one SPDM step, N_p = 60, scene on the device", 8.0),
     "SPDM 60, host to host": ("the same, from host to host", 8.0),
     "track + score 4096": ("track + score 4,096 trajectories, one scene", 100.0),
+    "navsim1 4096": ("NAVSIM v1: track + score 4,096 trajectories, one frame", 250.0),
+    "navsim2 4096": ("NAVSIM v2: the same, each with a previous plan", 300.0),
     "64 scenes x 60": ("64 scenarios x N_p = 60, one batch, from host to host", 200.0),
     "64 scenes x 60, placed": ("the same, scenes on the device", 200.0),
     "64 mixed scenes x 60": ("64 built-in scenes x N_p = 60, from host to host", 200.0),

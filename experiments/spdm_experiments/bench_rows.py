@@ -13,6 +13,7 @@ import numpy as np
 
 from spdm_experiments.bench_drives import drives
 from spdm_experiments.bench_learned import learned
+from spdm_experiments.bench_navsim import navsim_fans
 from spdm_experiments.bench_scenes import check_counts, scene_files
 from spdm_experiments.bench_stages import stages
 from spdm_experiments.bench_watch import Stopwatch
@@ -252,6 +253,8 @@ class Child:
             num_proposals=count,
             **counts,
         )
+
+        navsim_fans(self, scenes, fan(count), counts)
 
     def _one_program(self, scenes: ScenarioSet, vocabulary: np.ndarray) -> Callable[[], SubScores]:
         """Returns a call that scores a set in one block, with everything on the device before."""
