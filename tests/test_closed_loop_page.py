@@ -299,6 +299,9 @@ def test_page_is_repeatable_and_keeps_what_people_wrote(
 
 def test_figures_have_published_scores_as_hollow_marks(runs: list[Run]):
     panels = closed_loop_data.panels_of(runs)
+    faster = [dataclasses.replace(panels[0], step_ms={n: 1.0 for n in panels[0].points})]
+    times = closed_loop_figures.plot_runtime([*faster, *panels[1:]]).axes
+    assert times[0].get_ylim()[0] == 0 and times[0].get_ylim()[1] >= 16.0
     axes = closed_loop_figures.plot_score(panels).axes
     assert len(axes) == 3
     lines = {str(line.get_label()): line for line in axes[2].get_lines()}

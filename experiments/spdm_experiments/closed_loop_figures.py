@@ -96,8 +96,9 @@ def plot_runtime(panels: Sequence[Panel]) -> Figure:
             if points := curve(panel, planner):
                 counts, names = zip(*points, strict=True)
                 axis.plot(counts, [panel.step_ms[name] for name in names], label=planner, **look)
-        axis.set_ylim(bottom=0)
         axis.set_title(panel.title, pad=3)
+    # All share one scale: set sooner, it would end with the first panel's times.
+    axes[0].set_ylim(bottom=0)
     axes[0].set_ylabel("Time per step (ms)")
     _legend_of(figure, axes)
     return figure
