@@ -99,7 +99,7 @@ def test_order_of_tracks_lanes_and_blocks(planner: str, seed: int):
     np.testing.assert_array_equal(one.scores.collision_object, other.scores.collision_object)
 
 
-@pytest.mark.parametrize("planner", ["PDM", "SPDM"])
+@pytest.mark.parametrize("planner", ["PDM", pytest.param("SPDM", marks=pytest.mark.slow)])
 def test_equal_input_gives_equal_bytes(planner: str):
     one, other = (roads.plan(busy(), getattr(roads, planner)) for _ in range(2))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):

@@ -432,6 +432,7 @@ def test_the_player_shows_drives_and_lost_points(whole: Path, tmp_path: Path):
     assert told["other"] != "crash" and told["drive"].startswith("Log replay")
 
 
+@pytest.mark.slow
 def test_two_simulations_are_compared(pack: Path, whole: Path, tmp_path: Path):
     other = tmp_path / "other"
     assert run(pack, other, *DRIVERS, "--limit", "3") == 0

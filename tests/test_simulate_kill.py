@@ -56,6 +56,7 @@ def read_histories(out: Path) -> dict[tuple[str, int], np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 def test_killed_again_and_again_it_still_ends_equal(pack: Path, tmp_path: Path):
     whole, out = tmp_path / "whole", tmp_path / "run"
     assert cli.main(arguments(pack, whole)) == 0

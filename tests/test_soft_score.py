@@ -162,6 +162,7 @@ def test_padded_proposals_change_nothing(evaluate: Any, poses: jax.Array):
     assert not gradient.any()
 
 
+@pytest.mark.slow
 def test_ascent_leaves_a_collision(scenes: ScenarioSet, evaluate: Any, poses: jax.Array):
     """From straight into the parked car to a drive that the score itself likes."""
     row = SCENES.index("parked_car")
