@@ -111,8 +111,8 @@ def test_imports_are_declared(package):
         [*project["dependencies"], *extras["data"], *extras["plot"], *extras["cluster"]]
     )
     allowed |= set(sys.stdlib_module_names) | {package.__name__ for package in PACKAGES}
-    # Present wherever a notebook asks for an inline picture, a training step for scores, or NAVSIM's
-    # users for an export.
+    # Present wherever a notebook asks for an inline picture, a training step for scores, or a user
+    # of NAVSIM for an export.
     allowed |= {"IPython", "torch", "navsim"}
     undeclared = {
         name: sorted(map(str, paths))
