@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from spdm_jax.agents.forecast import React
 from spdm_jax.config import NUM_TRAJECTORY_STATES, PlannerParams
 from spdm_jax.planner import StepInput
-from spdm_jax.simulation.drivers import Driven, Driver
+from spdm_jax.simulation.drivers import Driver
 from spdm_jax.types import ProposalSet, Scenario
 
 from . import dipp
@@ -19,10 +19,10 @@ from .dipp_on_gameformer import DIPPRefinerConfig
 from .dipp_planner import TEST_SOLVER, DIPPPlannerConfig, bicycle, problem_from_features, solve
 from .gameformer_planner import own_center_path
 from .params import Params
-from .plan_frame import continued, plan_in_scene, proposals_in_scene
+from .plan_frame import continued, proposals_in_scene
 from .predictions import Prediction, futures_of
-from .scene_features import FeatureConfig, History, recorded_history
-from .sight import look
+from .scene_features import FeatureConfig, History
+from .sight import Planned, look, seeing_driver
 
 
 @dataclass(frozen=True)
@@ -67,19 +67,11 @@ def dipp_driver(params: Params, config: DIPPDriverConfig) -> Driver:
       config: static settings.
     """
 
-    def step(
-        scene: Scenario,
-        given: StepInput,
-        time: jax.Array,
-        state: History,
-        react: React | None = None,
-    ) -> Driven:
+    def think(scene: Scenario, given: StepInput, state: History, react: React | None) -> Planned:
         modes, best, history, overflow = _refine(params, scene, given, state, config, react)
-        poses = continued(modes(best), NUM_TRAJECTORY_STATES - 1)
-        return Driven(plan_in_scene(poses, given.ego, time), history, overflow)
+        return continued(modes(best), NUM_TRAJECTORY_STATES - 1), history, overflow
 
-    init = lambda scene: recorded_history(scene, -1)
-    return Driver("DIPP", init, step, step if config.prediction == "perfect" else None)
+    return seeing_driver("DIPP", think, reacting=config.prediction == "perfect")
 
 
 def dipp_proposals(

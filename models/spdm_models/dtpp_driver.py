@@ -7,16 +7,16 @@ import jax.numpy as jnp
 
 from spdm_jax.agents.forecast import React
 from spdm_jax.planner import StepInput
-from spdm_jax.simulation.drivers import Driven, Driver
+from spdm_jax.simulation.drivers import Driver
 from spdm_jax.types import ProposalSet, Scenario
 
 from .dtpp_planner import DTPPPlannerConfig, plan, scene_paths
 from .dtpp_tree import TreePlan
 from .params import Params
-from .plan_frame import plan_in_scene, proposals_in_scene
+from .plan_frame import proposals_in_scene
 from .predictions import Prediction, futures_of
-from .scene_features import FeatureConfig, History, recorded_history
-from .sight import look
+from .scene_features import FeatureConfig, History
+from .sight import Planned, look, seeing_driver
 
 MAP_RADIUS = 80.0
 """How far DTPP sees the map, m."""
@@ -51,19 +51,11 @@ def dtpp_driver(params: Params, config: DTPPDriverConfig) -> Driver:
       config: static settings.
     """
 
-    def step(
-        scene: Scenario,
-        given: StepInput,
-        time: jax.Array,
-        state: History,
-        react: React | None = None,
-    ) -> Driven:
+    def think(scene: Scenario, given: StepInput, state: History, react: React | None) -> Planned:
         tree, history, overflow = _search(params, scene, given, state, config, react)
-        poses = jnp.stack([tree.x, tree.y, tree.heading], axis=-1)
-        return Driven(plan_in_scene(poses, given.ego, time), history, overflow)
+        return jnp.stack([tree.x, tree.y, tree.heading], axis=-1), history, overflow
 
-    init = lambda scene: recorded_history(scene, -1)
-    return Driver("DTPP", init, step, step if config.prediction == "perfect" else None)
+    return seeing_driver("DTPP", think, reacting=config.prediction == "perfect")
 
 
 def dtpp_proposals(

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 
 from spdm_jax.agents.forecast import React
 from spdm_jax.planner import StepInput
-from spdm_jax.simulation.drivers import Driven, Driver
+from spdm_jax.simulation.drivers import Driver
 from spdm_jax.types import ProposalSet, Scenario
 
 from .gameformer_planner import GameFormerPlannerConfig, ego_modes, finish, predict
 from .params import Params
-from .plan_frame import plan_in_scene, proposals_in_scene
-from .scene_features import History, recorded_history
-from .sight import look
+from .plan_frame import proposals_in_scene
+from .scene_features import History
+from .sight import Planned, look, seeing_driver
 
 
 def gameformer_driver(
@@ -28,21 +28,14 @@ def gameformer_driver(
       config: static settings.
     """
 
-    def step(
-        scene: Scenario,
-        given: StepInput,
-        time: jax.Array,
-        state: History,
-        react: React | None = None,
-    ) -> Driven:
+    def think(scene: Scenario, given: StepInput, state: History, react: React | None) -> Planned:
         sight = look(scene, given, state, config.features)
         predicted = predict(params, scene, given, sight, config, react)
-        plan = predicted.output.plan
-        done = finish(plan, predicted, cost_weights, scene, given, sight, config)
-        return Driven(plan_in_scene(done.poses, given.ego, time), sight.history, done.overflow)
+        first = predicted.output.plan
+        done = finish(first, predicted, cost_weights, scene, given, sight, config)
+        return done.poses, sight.history, done.overflow
 
-    init = lambda scene: recorded_history(scene, -1)
-    return Driver(name, init, step, step if config.prediction == "perfect" else None)
+    return seeing_driver(name, think, reacting=config.prediction == "perfect")
 
 
 def gameformer_proposals(
