@@ -252,6 +252,11 @@ def to_device(scenarios: ScenarioBatch, dtype: DTypeLike = jnp.float32) -> Scena
     Raises:
       ValueError: `dtype` is not a floating type, or is 64 bit while JAX runs with 32.
     """
+    return leaves_to_device(scenarios, dtype).replace(origin=scenarios.origin)
+
+
+def leaves_to_device(tree: Any, dtype: DTypeLike) -> Any:
+    """Moves every leaf of a tree to the default device; see `to_device`."""
     kind = np.dtype(dtype)
     if not jnp.issubdtype(kind, jnp.floating):
         raise ValueError(f"dtype is {kind}; pass a floating type")
@@ -259,10 +264,10 @@ def to_device(scenarios: ScenarioBatch, dtype: DTypeLike = jnp.float32) -> Scena
         raise ValueError(f"dtype is {kind}, but 64-bit types are off; set jax_enable_x64")
 
     def move(leaf: Any) -> jax.Array:
-        floating = np.issubdtype(leaf.dtype, np.floating)
-        return jnp.asarray(leaf, dtype=kind if floating else leaf.dtype)
+        floating = np.issubdtype(np.asarray(leaf).dtype, np.floating)
+        return jnp.asarray(leaf, dtype=kind if floating else None)
 
-    return jax.tree.map(move, scenarios).replace(origin=scenarios.origin)
+    return jax.tree.map(move, tree)
 
 
 def _words(sizes: Mapping[str, int]) -> int:

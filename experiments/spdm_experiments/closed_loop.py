@@ -10,7 +10,7 @@ import argparse
 import json
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,8 @@ def main(argv: Sequence[str] | None = None, suites: Sequence[Suite] = SUITES) ->
     given = _options(argv)
     # The folder of each run, and its precision, are set where it is known.
     options = Simulate(scenes=Path(), out=given.out, chunk=given.chunk, device=given.device)
-    try:
+
+    def work() -> bool:
         good = True
         if given.step == "run":
             selected = "" if given.limit is None else f" --limit {given.limit}"
@@ -100,12 +101,25 @@ def main(argv: Sequence[str] | None = None, suites: Sequence[Suite] = SUITES) ->
         if given.page:
             for path in _write(given.page, given.out, suites, given.times):
                 print(f"written: {path}")
-        return 0 if good else EXIT_FAILED
+        return good
+
+    return exit_code("closed_loop", work)
+
+
+def exit_code(name: str, work: Callable[[], bool]) -> int:
+    """Does the work of a command that can be gone on with, and says how it ended.
+
+    Args:
+      name: of the command, in front of errors.
+      work: returns False if a scenario failed.
+    """
+    try:
+        return 0 if work() else EXIT_FAILED
     except KeyboardInterrupt:
         print("interrupted; the same command goes on where it stopped", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (ValueError, OSError, ImportError) as error:
-        print(f"closed_loop: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         return EXIT_ERROR
 
 
@@ -118,8 +132,23 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     steps = ("run", "precision", "page")
     parser.add_argument("step", nargs="?", choices=steps, default="run", help="what to do")
     parser.add_argument("--out", type=Path, default=Path("out/closed_loop"), help="run folders")
-    parser.add_argument("--page", type=Path, help="Markdown page to write, with figures beside it")
     parser.add_argument("--times", type=Path, help="another --out, whose run times the page shows")
+    options = parse_page_options(parser, argv)
+    if options.times and not options.page:
+        parser.error("--times needs --page, the Markdown file that shows them")
+    return options
+
+
+def parse_page_options(
+    parser: argparse.ArgumentParser, argv: Sequence[str] | None
+) -> argparse.Namespace:
+    """Adds what every command that drives suites and writes a page has, parses, and checks it.
+
+    Args:
+      parser: has `step`, one of whose choices is "page".
+      argv: arguments without the program's name; those of the process by default.
+    """
+    parser.add_argument("--page", type=Path, help="Markdown page to write, with figures beside it")
     parser.add_argument("--limit", type=int, help="take so many scenarios of each type only")
     parser.add_argument("--chunk", type=int, default=CHUNK, help="scenarios between two stops")
     parser.add_argument("--device", choices=("auto", "cpu", "gpu"), default="auto")
@@ -132,8 +161,6 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--page {options.page} must end in .md")
     if options.step == "page" and not options.page:
         parser.error("page needs --page, the Markdown file to write")
-    if options.times and not options.page:
-        parser.error("--times needs --page, the Markdown file that shows them")
     return options
 
 

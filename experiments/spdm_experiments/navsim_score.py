@@ -18,7 +18,7 @@ from spdm_experiments.navsim_files import (
 from spdm_experiments.options import Score
 from spdm_experiments.record import Record
 from spdm_experiments.runs import MAX_LINES, close
-from spdm_experiments.runtime import Clock, stop_between_chunks
+from spdm_experiments.runtime import Clock, stop_after
 from spdm_experiments.terminal import progress_line
 from spdm_experiments.trajectory_file import read_trajectories, stored_shape
 from spdm_jax import NavsimScoreSet
@@ -83,7 +83,7 @@ def run_navsim_score(options: Score) -> bool:
     table = _table(about["suite"], profile)
     done, padding = 0, common_padding(inventory.entries)
     with (
-        stop_between_chunks() as stopping,
+        stop_after("chunk") as stopping,
         progress_line("scoring", len(found.paths)) as advance,
     ):
         for rows in split(len(found.paths), options.chunk):

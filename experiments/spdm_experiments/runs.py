@@ -13,7 +13,7 @@ from spdm_experiments.navsim_files import refuse_frames
 from spdm_experiments.options import Chunked, Plan, Score, Show
 from spdm_experiments.planners import describe, make_planner
 from spdm_experiments.record import RUN, Record, unusable
-from spdm_experiments.runtime import Clock, provenance_text, stop_between_chunks
+from spdm_experiments.runtime import Clock, provenance_text, stop_after
 from spdm_experiments.terminal import print_files, progress_line, reasons
 from spdm_experiments.trajectory_file import read_trajectories
 from spdm_jax import PlannerConfig, PlanSet, ScenarioSet, ScoreSet, load
@@ -187,7 +187,7 @@ def _go_through(
     """
     total, done = len(found.paths), 0
     label = "planning" if isinstance(options, Plan) else "scoring"
-    with stop_between_chunks() as stopping, progress_line(label, total) as advance:
+    with stop_after("chunk") as stopping, progress_line(label, total) as advance:
         pending = chunks(found, options.chunk)
         while done < total and not stopping():
             with clock.loading():

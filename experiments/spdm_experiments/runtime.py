@@ -103,8 +103,12 @@ class Clock:
 
 
 @contextmanager
-def stop_between_chunks() -> Iterator[Callable[[], bool]]:
+def stop_after(unit: str, *more: signal.Signals) -> Iterator[Callable[[], bool]]:
     """Turns the first Ctrl-C into a wish to stop; a second one interrupts at once.
+
+    Args:
+      unit: what is finished first, for the message.
+      more: other signals that count as Ctrl-C.
 
     Yields:
       A function that says whether the user wants to stop.
@@ -116,13 +120,14 @@ def stop_between_chunks() -> Iterator[Callable[[], bool]]:
         if asked:
             raise KeyboardInterrupt
         asked = True
-        print("stopping after this chunk; Ctrl-C again stops at once", file=sys.stderr)
+        print(f"stopping after this {unit}; Ctrl-C again stops at once", file=sys.stderr)
 
-    before = signal.signal(signal.SIGINT, ask)
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, *more)}
     try:
         yield lambda: asked
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def now() -> str:

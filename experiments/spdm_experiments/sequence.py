@@ -14,7 +14,7 @@ from typing import Any
 from spdm_experiments.inventory import Inventory, Shard, take_inventory
 from spdm_experiments.parts import part_name
 from spdm_experiments.run_folder import Progress, alone, note
-from spdm_experiments.runtime import stop_between_chunks
+from spdm_experiments.runtime import stop_after
 from spdm_experiments.terminal import RateLine, print_files, reasons
 from spdm_experiments.work import Done
 from spdm_jax import Failure
@@ -168,7 +168,7 @@ def _work(verb: Verb, shard: Shard, missing: set[str], tally: Tally, total: int)
     progress = Progress(verb.folder, shard, verb.origin)
     before = len(tally.reasons) - tally.scenarios
     line = RateLine(total, before)
-    with stop_between_chunks() as stopping:
+    with stop_after("chunk") as stopping:
         line.show(len(tally.reasons), 0.0, 0, 0.0)
         progress.save(tally.counts(total), tally.work())
         for done in verb.run(shard, missing - tally.reasons.keys(), stopping):

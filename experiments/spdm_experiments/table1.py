@@ -16,11 +16,10 @@ from typing import Any
 
 from spdm_experiments.closed_loop import (
     ABOUT,
-    EXIT_ERROR,
-    EXIT_FAILED,
-    EXIT_INTERRUPTED,
     drive,
+    exit_code,
     note_machine,
+    parse_page_options,
 )
 from spdm_experiments.options import Simulate
 from spdm_experiments.report_data import load_run
@@ -32,8 +31,6 @@ from spdm_experiments.table1_page import score_table, write_page
 from spdm_jax.io.scenario_file import write_atomically
 
 WEIGHTS, TABLE = "weights.json", "table1.parquet"
-CHUNK = 4
-"""Scenarios of a chunk: each is driven by every planner, and a chunk is what a stop can cost."""
 
 
 def main(argv: Sequence[str] | None = None, scenes: Path | None = None) -> int:
@@ -45,7 +42,8 @@ def main(argv: Sequence[str] | None = None, scenes: Path | None = None) -> int:
     """
     given = _options(argv)
     options = Simulate(scenes=Path(), out=given.out, chunk=given.chunk, device=given.device)
-    try:
+
+    def work() -> bool:
         good = True
         if given.step == "run":
             configure_jax(options)
@@ -58,13 +56,9 @@ def main(argv: Sequence[str] | None = None, scenes: Path | None = None) -> int:
                 good &= drive(suite, replace(options, out=given.out / suite.name), given.limit)
         for path in _write(given.page, given.out):
             print(f"written: {path}")
-        return 0 if good else EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on where it stopped", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except (ValueError, OSError, ImportError) as error:
-        print(f"table1: {error}", file=sys.stderr)
-        return EXIT_ERROR
+        return good
+
+    return exit_code("table1", work)
 
 
 def _options(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -80,20 +74,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--planner", choices=PLANNERS, nargs="+", default=PLANNERS, help="these rows only")
     keys = tuple(column.key for column in COLUMNS)
     add("--column", choices=keys, nargs="+", default=keys, help="these columns only")
-    add("--page", type=Path, help="Markdown page to write, with a figure beside it")
-    add("--limit", type=int, help="take so many scenarios of each type only")
-    add("--chunk", type=int, default=CHUNK, help="scenarios between two stops")
-    add("--device", choices=("auto", "cpu", "gpu"), default="auto")
-    options = parser.parse_args(argv)
-    for name in ("limit", "chunk"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            parser.error(f"--{name} is {value}; it must be at least 1")
-    if options.page and options.page.suffix != ".md":
-        parser.error(f"--page {options.page} must end in .md")
-    if options.step == "page" and not options.page:
-        parser.error("page needs --page, the Markdown file to write")
-    return options
+    return parse_page_options(parser, argv)
 
 
 def _command(given: argparse.Namespace) -> str:

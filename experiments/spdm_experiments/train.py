@@ -14,8 +14,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from spdm_experiments.description import describe
-from spdm_experiments.runtime import configure_jax, provenance
+from spdm_experiments.runtime import configure_jax, provenance, stop_after
 from spdm_experiments.terminal import print_files, reasons
 from spdm_experiments.train_options import Train
 from spdm_jax.io.scenario_file import write_atomically
@@ -99,7 +98,7 @@ def run_train(options: Train) -> bool:
     # As JSON has it: tuples become lists.
     about = json.loads(json.dumps(about))
     line = _StepLine(config.steps, per_epoch)
-    with _stop_soon() as stop:
+    with stop_after("step", signal.SIGTERM) as stop:
         fitted = fit(
             task,
             samples.train,
@@ -218,23 +217,3 @@ class _StepLine:
         """Leaves the line."""
         if self._terminal:
             sys.stderr.write("\n")
-
-
-@contextmanager
-def _stop_soon() -> Iterator[Callable[[], bool]]:
-    """Turns a first Ctrl-C, or SIGTERM, into a wish to stop; a second one interrupts at once."""
-    asked = False
-
-    def ask(signum: int, frame: object) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        print("stopping after this step; once more stops at once", file=sys.stderr)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

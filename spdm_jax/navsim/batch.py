@@ -13,6 +13,7 @@ from jax.typing import DTypeLike
 
 from spdm_jax.geometry import PADDED_PROGRESS
 from spdm_jax.navsim.types import NavsimScene
+from spdm_jax.padding import leaves_to_device
 
 LEAST_ROOM = {
     "centerline": 256,
@@ -126,17 +127,7 @@ def to_device(scene: NavsimScene, dtype: DTypeLike = jnp.float32) -> NavsimScene
     Raises:
       ValueError: `dtype` is not a floating type, or is 64 bit while JAX runs with 32.
     """
-    kind = np.dtype(dtype)
-    if not jnp.issubdtype(kind, jnp.floating):
-        raise ValueError(f"dtype is {kind}; pass a floating type")
-    if jax.dtypes.canonicalize_dtype(kind) != kind:
-        raise ValueError(f"dtype is {kind}, but 64-bit types are off; set jax_enable_x64")
-
-    def move(leaf: Any) -> jax.Array:
-        floating = np.issubdtype(np.asarray(leaf).dtype, np.floating)
-        return jnp.asarray(leaf, dtype=kind if floating else None)
-
     host = {name: getattr(scene, name) for name in _HOST_ONLY}
     # In place of what stays: a jitted function would otherwise bring it to the device.
     light = scene.replace(**{name: np.zeros((), np.int32) for name in host})
-    return jax.tree.map(move, light).replace(**host)
+    return leaves_to_device(light, dtype).replace(**host)
