@@ -9,10 +9,12 @@ import jax
 import numpy as np
 import pytest
 
+from navsim_stand_in import metric_cache, replay, road_scene
 from spdm_experiments import (
     bench,
     bench_drives,
     bench_learned,
+    bench_navsim,
     bench_page,
     bench_process,
     bench_rows,
@@ -20,6 +22,8 @@ from spdm_experiments import (
     bench_watch,
 )
 from spdm_jax import from_raw
+from spdm_jax.io.raw import ScenarioError
+from spdm_jax.navsim.navsim_export import export, write
 from spdm_jax.synthetic.suites import SUITES
 from spdm_jax.types import SubScores
 
@@ -162,6 +166,43 @@ def test_page_shows_learned_planners_beside_torch(tmp_path: Path):
     text = (tmp_path / "page.md").read_text(encoding="utf-8")
     assert "| GameFormer | 32 | 2000.0 / 1000.0 | 100.0 | 174 |" in text
     assert "| DTPP | 9.0 | 2 |" in text
+
+
+def test_page_shows_frames_of_navsim(tmp_path: Path):
+    counts = {"objects": 84, "polygons": 381, "num_proposals": 4096}
+    rows = [
+        *made_up_rows(),
+        row("navsim1 4096, x", 200.0, **counts, frames=1, recorded=True),
+        row("navsim2 4096, x", 320.0, **counts, frames=1, recorded=True),
+        row("navsim2 64 x 64", 800.0, frames=64, num_proposals=64),
+    ]
+    bench_page.write_page(tmp_path / "page.md", ABOUT, rows, {})
+    text = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert "recorded | 84 / 381 | 1 x 4,096 | 250 ms | 200.0 / 100.0 ms" in text
+    assert line_with(text, "| 300 ms |").endswith("| 16.00 | 12,800 | no |")
+    assert line_with(text, "| 64 x 64 |").endswith("| 40.00 | 5,120 |  |")
+
+
+def test_recorded_frames_are_scored_by_what_they_serve(tmp_path: Path):
+    scene = road_scene()
+    for devkit, samples in (("v1", 51), ("v2", 41)):
+        cache = metric_cache(replay(scene, samples), devkit)
+        write(tmp_path / f"{devkit}.npz", export(cache, devkit))
+    child = bench_rows.Child(bench_rows.SIZES["quick"], "f32", tmp_path)
+    bench_navsim.recorded_frames(child, bench_rows.fan(4))
+    first, second = child.rows
+    assert (first["workload"], second["workload"]) == ("navsim1 4, v1", "navsim2 4, v2")
+    assert first["polygons"] == len(scene["map_kind"]) and first["recorded"]
+    assert 0 < first["mean_score"] <= 1
+    (tmp_path / "v1.npz").write_bytes(b"no frame")
+    with pytest.raises(ScenarioError, match=r"v1\.npz"):
+        bench_navsim.recorded_frames(child, bench_rows.fan(4))
+
+
+def test_frames_that_are_not_there_are_refused(tmp_path: Path, capsys):
+    with pytest.raises(SystemExit):
+        bench.main(["--frames", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert "holds no .npz file" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -326,7 +367,7 @@ def test_only_what_was_asked_for_is_measured(tmp_path: Path):
 
 
 def test_failed_child_leaves_what_was_finished(tmp_path: Path, monkeypatch, capsys):
-    def broken(results, out, scale):
+    def broken(results, out, scale, frames):
         results.unit("steps", lambda: [row("PDM-Closed 15", 3.0)])
         raise subprocess.CalledProcessError(3, ["python", "-m", "child"])
 
@@ -338,7 +379,7 @@ def test_failed_child_leaves_what_was_finished(tmp_path: Path, monkeypatch, caps
 
 
 def test_finished_run_writes_table_and_page(tmp_path: Path, monkeypatch, capsys):
-    def finished(results, out, scale):
+    def finished(results, out, scale, frames):
         results.unit("steps", made_up_rows)
         for name, found in APART.items():
             results.unit(name, lambda found=found: found)

@@ -32,6 +32,7 @@ KINDS = (
     "batches",
     "drives",
     "learned",
+    "frames",
     "first call",
     "first drive",
     "memory",
@@ -170,8 +171,14 @@ def _memory(scenes: Path, cache: Path, kind: str, count: int) -> dict[str, Any]:
     return runs[-1]
 
 
-def measure_all(results: Results, out: Path, scale: str) -> None:
+def measure_all(results: Results, out: Path, scale: str, frames: Path | None = None) -> None:
     """Measures what is missing, child by child.
+
+    Args:
+      results: takes what is measured.
+      out: folder for scenes and compiled programs.
+      scale: "full" or "quick".
+      frames: folder of exported frames of NAVSIM to be timed as well.
 
     Raises:
       subprocess.CalledProcessError: a child failed.
@@ -192,6 +199,9 @@ def measure_all(results: Results, out: Path, scale: str) -> None:
     children(cores, "f32", scale)
     name = f"learned, f32, {cores} core(s)"
     results.unit(name, lambda: _child("learned", cores, "f32", scale, scenes))
+    if frames:
+        name = f"frames of {frames.resolve()}, f32, {cores} core(s)"
+        results.unit(name, lambda: _child("frames", cores, "f32", scale, frames))
     # A first call compiles anew: too slow for a toy run.
     planners = (("PDM-Closed", 15), ("SPDM", 60)) if full else ()
     memories = (("trajectories", 4096), ("scenes", 16), ("scenes", 64), ("scenes", 256))
@@ -218,6 +228,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="a toy run that shows it works")
     parser.add_argument("--page", type=Path, help="Markdown page to write, with curves beside it")
     parser.add_argument("--only", choices=KINDS, nargs="+", default=(), help="kinds of rows")
+    parser.add_argument("--frames", type=Path, help="folder of frames exported from NAVSIM")
     parser.add_argument("--again", action="store_true", help="measure anew what is there already")
     parser.add_argument("--device", choices=("auto", *PLATFORMS), default="auto")
     parser.add_argument("--child", default="", help=argparse.SUPPRESS)
@@ -228,6 +239,8 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--page {options.page} must end in .md")
     if options.page and options.only:
         parser.error("--page shows all rows; leave --only out, what is measured already stays")
+    if options.frames and not any(options.frames.glob("*.npz")):
+        parser.error(f"--frames {options.frames} holds no .npz file; see spdm navsim-script")
     return options
 
 
@@ -267,7 +280,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if results.resumed:
         print(f"{results.path}: {len(results.units)} units are there already", file=sys.stderr)
     try:
-        measure_all(results, options.out, scale)
+        measure_all(results, options.out, scale, options.frames)
     except subprocess.CalledProcessError as error:
         print(
             f"{shlex.join(error.cmd)} ended with {error.returncode}; {results.path} has what was "

@@ -8,14 +8,19 @@ from spdm_experiments.markdown import kept_part, markdown_table
 
 Row = Mapping[str, Any]
 
+NAVSIM_MS = {"navsim1": 250.0, "navsim2": 300.0}
+"""4,096 trajectories in one frame."""
 MARKS_MS = {
     "PDM-Closed 15": ("one PDM-Closed step, N_p = 15, scene on the device", 4.0),
     "PDM-Closed 15, host to host": ("the same, from host to host", 4.0),
     "SPDM 60": ("one SPDM step, N_p = 60, scene on the device", 8.0),
     "SPDM 60, host to host": ("the same, from host to host", 8.0),
     "track + score 4096": ("track + score 4,096 trajectories, one scene", 100.0),
-    "navsim1 4096": ("NAVSIM v1: track + score 4,096 trajectories, one frame", 250.0),
-    "navsim2 4096": ("NAVSIM v2: the same, each with a previous plan", 300.0),
+    "navsim1 4096": (
+        "NAVSIM v1: track + score 4,096 trajectories, one frame",
+        NAVSIM_MS["navsim1"],
+    ),
+    "navsim2 4096": ("NAVSIM v2: the same, each with a previous plan", NAVSIM_MS["navsim2"]),
     "64 scenes x 60": ("64 scenarios x N_p = 60, one batch, from host to host", 200.0),
     "64 scenes x 60, placed": ("the same, scenes on the device", 200.0),
     "64 mixed scenes x 60": ("64 built-in scenes x N_p = 60, from host to host", 200.0),
@@ -79,6 +84,7 @@ def write_page(page: Path, about: Row, rows: Sequence[Row], apart: Mapping[str, 
         _about(about, main),
         _marks(main, apart),
         _drives(main, apart),
+        _navsim(main),
         _learned(main),
         "## Other precision, other cores\n\nMedian / minimum, ms.\n",
         _columns(rows),
@@ -221,6 +227,37 @@ def _drives(rows: Sequence[Row], apart: Mapping[str, Row]) -> str:
         )
     head = ["traffic", "scenarios", "to reach", "per scenario", "yardsticks", "reached"]
     return f"## Closed loop\n\n{text}{markdown_table(head, body)}"
+
+
+def _navsim(rows: Sequence[Row]) -> str:
+    """The section on NAVSIM's scores; empty where none were measured."""
+    body = []
+    for row in (row for row in rows if "frames" in row):
+        profile = row["workload"].partition(" ")[0]
+        scored = row["frames"] * row["num_proposals"]
+        mark = NAVSIM_MS[profile] if row["frames"] == 1 and row["num_proposals"] == 4096 else None
+        body.append(
+            [
+                profile,
+                "recorded" if row.get("recorded") else "generated",
+                f"{row['objects']} / {row['polygons']}",
+                f"{row['frames']} x {row['num_proposals']:,}",
+                f"{mark:g} ms" if mark else "",
+                f"{row['median_ms']:.1f} / {row['min_ms']:.1f} ms",
+                f"{row['median_ms'] / row['yardstick_ms']:.2f}",
+                f"{1e3 * scored / row['median_ms']:,.0f}",
+                _reached(row["median_ms"], mark) if mark else "",
+            ]
+        )
+    if not body:
+        return ""
+    head = ["profile", "frames", "objects / polygons", "frames x trajectories", "to reach"]
+    head += ["median / min", "yardsticks", "trajectories per second", "reached"]
+    return (
+        "## NAVSIM\n\nFrom poses on the host to scores on the host: interpolation, tracking, the "
+        "replay of the log and all terms. One frame: each trajectory with a previous plan of its "
+        "own in v2.\n\n" + markdown_table(head, body)
+    )
 
 
 def _learned(rows: Sequence[Row]) -> str:

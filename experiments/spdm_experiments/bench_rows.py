@@ -13,7 +13,12 @@ import numpy as np
 
 from spdm_experiments.bench_drives import drives
 from spdm_experiments.bench_learned import learned
-from spdm_experiments.bench_navsim import navsim_fans
+from spdm_experiments.bench_navsim import (
+    TRAJECTORIES,
+    navsim_batch,
+    navsim_fans,
+    recorded_frames,
+)
 from spdm_experiments.bench_scenes import check_counts, scene_files
 from spdm_experiments.bench_stages import stages
 from spdm_experiments.bench_watch import Stopwatch
@@ -99,7 +104,7 @@ SIZES = {
         learned_drives=False,
     ),
 }
-GROUPS = ("steps", "fans", "batches", "drives", "learned")
+GROUPS = ("steps", "fans", "batches", "drives", "learned", "frames")
 """What one child measures."""
 
 
@@ -124,7 +129,7 @@ def measure(group: str, size: Size, precision: Precision, folder: Path) -> list[
       group: one of `GROUPS`.
       size: how much.
       precision: floating type of everything on the device.
-      folder: packed scenes, see `bench_scenes.pack_scenes`.
+      folder: packed scenes, see `bench_scenes.pack_scenes`; for "frames" exported frames of NAVSIM.
 
     Raises:
       RuntimeError: results differ that must be equal.
@@ -139,6 +144,7 @@ def measure(group: str, size: Size, precision: Precision, folder: Path) -> list[
         "batches": child.batches,
         "drives": lambda: drives(child),
         "learned": lambda: learned(child),
+        "frames": lambda: recorded_frames(child, fan(max(size.fans))),
     }[group]()
     device = jax.devices()[0]
     about = {
@@ -285,6 +291,7 @@ class Child:
         self._batch(
             f"{self.size.mixed} mixed scenes x {count}", load(files), planner, num_proposals=count
         )
+        navsim_batch(self, every, fan(TRAJECTORIES), **counts)
         expected = plan(every, planner, precision=self.precision).scores
         self.add(
             f"{len(every)} scenes x {count}, placed",
