@@ -505,3 +505,8 @@ def test_show_names_a_scene_that_is_not_there(
 ):
     assert cli.main(["show", str(pack), *arguments]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_a_checkout_on_the_path_has_no_version():
+    assert runtime.version_of("numpy") == np.__version__
+    assert runtime.version_of("no-such-package") == "not installed"

@@ -9,7 +9,6 @@ the same command goes on where an interrupted one stopped.
 
 import argparse
 import hashlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -251,7 +250,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _answer(options.child, options.out)
     from spdm_experiments.bench_page import table, write_page
     from spdm_experiments.bench_scenes import SUITE
-    from spdm_experiments.runtime import commit, now
+    from spdm_experiments.runtime import commit, now, version_of
     from spdm_jax.batching import usable_cores
 
     if options.device != "auto":
@@ -264,7 +263,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "machine": processor(),
         "cores": usable_cores(),
         "platforms": os.environ.get("JAX_PLATFORMS", ""),
-        "versions": {name: importlib.metadata.version(name) for name in VERSIONED},
+        "versions": {name: version_of(name) for name in VERSIONED},
         "python": platform.python_version(),
     }
     about = {

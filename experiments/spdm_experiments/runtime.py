@@ -135,13 +135,21 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
+def version_of(package: str) -> str:
+    """Returns the installed version of a package; a checkout on the path has none."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
 def provenance() -> dict[str, object]:
     """Returns versions, the commit of the checkout (None outside one) and the device."""
     import jax
 
     device = jax.devices()[0]
     return {
-        "versions": {name: importlib.metadata.version(name) for name in _VERSIONED},
+        "versions": {name: version_of(name) for name in _VERSIONED},
         "commit": commit(),
         "device": f"{device.device_kind} ({device.platform})",
     }
