@@ -209,7 +209,7 @@ def test_frames_that_are_not_there_are_refused(tmp_path: Path, capsys):
 def test_networks_of_the_benchmark_run():
     for network in bench_learned.networks(16).values():
         params = network.init(jax.random.key(0))
-        output = jax.jit(network.forward)(params, network.inputs(2))
+        output = network.compiled()(params, network.inputs(2))
         for leaf in jax.tree.leaves(output):
             assert np.isfinite(leaf).all()
 

@@ -15,10 +15,11 @@ from spdm_experiments.simulate_points import NAMES, entries_of, make_points, wei
 from spdm_jax.io.build import build_scenario
 from spdm_jax.io.scenario_file import write_scenario
 from spdm_models import drivers, dtpp, gameformer
+from spdm_models.checkpoint import read_metadata
 from spdm_models.dtpp import DTPPConfig
 from spdm_models.gameformer import GameFormerConfig
 from spdm_models.scene_encoder import EncoderConfig
-from spdm_models.weights import save_weights
+from spdm_models.weights import SMALL_WEIGHTS, save_weights
 
 ENCODER = EncoderConfig(width=16, heads=8, layers=1)
 NETWORK = GameFormerConfig(ENCODER, levels=1, modes=2, neighbors=3)
@@ -86,6 +87,28 @@ def test_a_folder_of_weights_is_one_of_files_or_of_trainings(weights: Path, tmp_
     trained.parent.mkdir()
     trained.write_bytes(file.read_bytes())
     assert weights_file(tmp_path, "dtpp") == trained
+    for planner in ("gameformer-path", "gameformer-dipp"):
+        assert weights_file(weights, planner) == weights / "gameformer.safetensors"
+    own = tmp_path / "gameformer-dipp.safetensors"
+    own.touch()
+    assert weights_file(tmp_path, "gameformer-dipp") == own
+
+
+def test_small_weights_come_with_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    files = sorted(SMALL_WEIGHTS.glob("*.safetensors"))
+    assert sum(path.stat().st_size for path in files) < 10e6
+    found = points(Path("small"), planner=("gameformer", "gameformer-dipp", "dipp", "dtpp"))
+    assert [point["weights"].split()[0] for point in found] == [*["gameformer"] * 3, "dtpp"]
+    recipe = (SMALL_WEIGHTS / "README.md").read_text(encoding="utf-8")
+    for path in files:
+        training = read_metadata(path)["training"]
+        assert f"spdm train {training['task']} " in recipe and training["seed"] == 0
+        assert f"| {training['validation']['planADE']:.2f} |" in recipe
+    # A folder of that name goes before.
+    (tmp_path / "small").mkdir()
+    with pytest.raises(ValueError, match="no such file of weights for dtpp"):
+        points(Path("small"), planner=("dtpp",))
 
 
 @pytest.mark.parametrize(
@@ -98,7 +121,7 @@ def test_a_folder_of_weights_is_one_of_files_or_of_trainings(weights: Path, tmp_
             "--prediction is for learned planners",
         ),
         ({"planner": ("dtpp",), "replan_every": 2}, "leave --replan-every out"),
-        ({"planner": ("gameformer-dipp",)}, "no such file of weights for gameformer-dipp"),
+        ({"planner": ("dipp",), "weights": Path("none")}, "no such file of weights for dipp"),
         (
             {"planner": ("gameformer",), "weights": Path("dtpp.safetensors")},
             "holds weights of dtpp; gameformer takes",

@@ -177,7 +177,7 @@ def test_page_shows_scores_weights_and_a_figure(runs: list[Run], tmp_path: Path)
     page.write_text("old\n\n## What the runs show\n\nA thought.\n", encoding="utf-8")
     facts = {"file": "dtpp.safetensors", "digest": "abc", "model": "dtpp", "sizes": "width 16"}
     about = {
-        "command": "python -m spdm_experiments.table1 run",
+        "commands": ["python -m spdm_experiments.table1 run"],
         "machines": ["Some Processor"],
         "weights": {
             "dtpp": {**facts, "training": {}},

@@ -273,8 +273,9 @@ def _learned(rows: Sequence[Row]) -> str:
         body.append([row["network"], str(row["batch"]), ms, sticks, str(quoted)])
     head = ["forward pass", "scenes", "median / min, ms", "yardsticks", "torch, yardsticks"]
     text = (
-        "Networks of the published sizes with random weights; what the public torch code takes on "
-        "two cores is quoted.\n\n" + markdown_table(head, body)
+        "Networks of the published sizes with random weights, batches on a processor in blocks of "
+        "a few scenes (`jax.lax.map` with a `batch_size`); what the public torch code takes on two "
+        "cores is quoted.\n\n" + markdown_table(head, body)
     )
     if drives := [row for row in rows if row["workload"].endswith(", one drive")]:
         lines = [

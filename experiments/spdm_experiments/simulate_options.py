@@ -48,7 +48,8 @@ class Simulate(OverGrid):
     weights: Path | None = None
     """Weights of the learned planners (gameformer, gameformer-path, gameformer-dipp, dipp, dtpp): a
     file of spdm train or spdm convert, or a folder with PLANNER.safetensors, or the folder PLANNER
-    of spdm train, for each (gameformer-path takes gameformer's)."""
+    of spdm train, for each (gameformer-path and gameformer-dipp take gameformer's where they have
+    none); small: those that come with the package."""
     prediction: tuple[Prediction, ...] = ()
     """What learned planners take for the other agents' future: their own predictions (learned, if
     left out), the record or how the agents would react (perfect), or nothing (none)."""

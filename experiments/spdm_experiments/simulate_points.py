@@ -13,6 +13,7 @@ from spdm_experiments.sweep_grid import point_of
 from spdm_jax import PlannerConfig, PlannerParams
 from spdm_models import drivers
 from spdm_models.drivers import LearnedPlanner, Weights
+from spdm_models.weights import SMALL_WEIGHTS
 
 NAMES = {
     "spdm": "SPDM",
@@ -107,7 +108,9 @@ def _check_learned(options: Simulate) -> None:
         if given and not learned:
             raise ValueError(f"{name} is for learned planners: {', '.join(_LEARNED)}")
     if learned and options.weights is None:
-        raise ValueError(f"{learned[0]} needs --weights, a file of spdm train or spdm convert")
+        raise ValueError(
+            f"{learned[0]} needs --weights: a file of spdm train or spdm convert, or small"
+        )
     if learned and options.replan_every != 1:
         raise ValueError(
             f"{learned[0]} has to see every step of the last 2 s; leave --replan-every out"
@@ -149,13 +152,21 @@ def _of_planner(options: Simulate, planner: str, traffic: str, mode: str) -> Ite
         yield Point(planner, made.num_proposals, traffic, mode, settings, spec.config, spec.params)
 
 
+def weights_folder(given: Path) -> Path:
+    """Returns what --weights names; "small" is the folder that comes with the package."""
+    return SMALL_WEIGHTS if given == Path("small") and not given.exists() else given
+
+
 def weights_file(given: Path, planner: LearnedName) -> Path:
     """Returns where a planner's weights are: the file itself, or the folder's file of its name."""
+    given = weights_folder(given)
     if not given.is_dir():
         return given
-    name = "gameformer" if planner == "gameformer-path" else planner
-    trained = given / name / "weights.safetensors"
-    return trained if trained.is_file() else given / f"{name}.safetensors"
+    # Planners on GameFormer share its weights where they have none of their own.
+    names = (planner, "gameformer") if planner.startswith("gameformer") else (planner,)
+    kinds = ("{}/weights.safetensors", "{}.safetensors")
+    found = [given / kind.format(name) for name in names for kind in kinds]
+    return next((path for path in found if path.is_file()), given / f"{planner}.safetensors")
 
 
 def _weights(given: Path, planner: LearnedName) -> Weights:

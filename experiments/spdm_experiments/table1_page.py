@@ -35,7 +35,7 @@ def write_page(
       page: Markdown file.
       cells: of the table.
       runs: one per column, finished or not.
-      about: `command`, `machines` and `weights`, the facts of each planner's file.
+      about: `commands`, `machines` and `weights`, the facts of each planner's file.
 
     Returns:
       The files written.
@@ -102,9 +102,10 @@ def _about(runs: Sequence[Run], about: Mapping[str, Any]) -> str:
     head = ["", *(str(run.folder.name) for run in runs)]
     body = [["scenarios", *(done(run) for run in runs)]]
     body += [[key, *(str(run.about.get(key) or "unknown") for run in runs)] for key in keys]
+    commands = " and ".join(f"`{command}`" for command in about["commands"])
     return (
         markdown_table(head, body)
-        + f"\nWritten by `{about['command']}`. Machine: {'; '.join(about['machines'])}. Suites, "
+        + f"\nWritten by {commands}. Machine: {'; '.join(about['machines'])}. Suites, "
         "traffic and metrics are those of [spdm simulate](simulate.md); how each planner is made "
         "and what takes the place of its predictions is said in [Learned models](models.md).\n"
     )

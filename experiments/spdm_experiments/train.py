@@ -118,6 +118,10 @@ def run_train(options: Train) -> bool:
         "task": options.model,
         "size": options.size,
         "steps": config.steps,
+        "batch": config.batch,
+        "rate": task.recipe.rate if config.rate is None else config.rate,
+        "dropout": config.dropout,
+        "stride": options.stride,
         "seed": options.seed,
         # Of the first start: the same weights have the same header, whoever went on with them.
         **{name: value for name, value in started.items() if name in facts},

@@ -20,6 +20,8 @@ from .state_dict import Extras, from_state_dict, to_state_dict
 
 ModelName = Literal["gameformer", "dtpp", "dipp"]
 Config = GameFormerConfig | DTPPConfig | DIPPConfig
+SMALL_WEIGHTS = Path(__file__).with_name("small")
+"""Small trained weights that come with the package: PLANNER.safetensors, and how they were made."""
 
 
 @dataclass(frozen=True)
