@@ -198,6 +198,23 @@ def test_page_shows_scores_weights_and_a_figure(runs: list[Run], tmp_path: Path)
     assert perfect.count("*N/A*") == 2
 
 
+def test_planners_driven_apart_share_a_page(weights: Path, tmp_path: Path, capsys):
+    outs = (tmp_path / "first", tmp_path / "second")
+    for number, (out, column) in enumerate(zip(outs, COLUMNS, strict=False)):
+        made_up(out, column, weights)
+        about = {"command": f"command {number}", "machines": ["Some Processor"]}
+        (out / "about.json").write_text(json.dumps(about), encoding="utf-8")
+        (out / "weights.json").write_text("{}", encoding="utf-8")
+    page = tmp_path / "table1.md"
+    command = ["page", "--out", str(outs[0]), "--also", str(outs[1]), "--page", str(page)]
+    assert table1.main(command) == 0
+    frame = polars.read_parquet(outs[0] / "table1.parquet")
+    assert set(frame["traffic"]) == {"replay", "reactive"} and frame.height == 15 + 14
+    text = page.read_text(encoding="utf-8")
+    assert "Written by `command 0` and `command 1`. Machine: Some Processor." in text
+    assert str(outs[1] / "table1.parquet") not in capsys.readouterr().out
+
+
 def test_command_refuses_what_cannot_be(weights: Path, tmp_path: Path, capsys):
     run = ["run", "--out", str(tmp_path / "out")]
     for more, said in (
