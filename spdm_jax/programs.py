@@ -26,10 +26,13 @@ from typing import Any
 
 import jax
 import jax.monitoring
+import jax.numpy as jnp
+import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 _FOLDER = "programs"
 _KEPT = 400  # names of stored programs; the ones used least recently go first
+_LAPACK = "@lapack_"  # in the text of programs that call it
 _MAPS, _MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _MAP_SHARE = 0.6  # of the memory maps that a process may have, in use before programs are dropped
 
@@ -92,7 +95,8 @@ def program(
         else:
             traced = make().trace(*args)
             lowered, used = traced.lower(), _used(traced.jaxpr.jaxpr)
-            twin = path and _twin(path, lowered, (str(tree), shapes, used), devices)
+            text = lowered.as_text() if path else ""
+            twin = path and _twin(path, text, (str(tree), shapes, used), devices)
             stored = twin and _load(twin, tree, devices)
             if stored:
                 call, _ = stored
@@ -100,7 +104,7 @@ def program(
                 with _not_kept_by_jax() as hits:
                     call = lowered.compile(compiler_options=_compiler_options(devices))
                 if twin and not hits:
-                    _store(twin, call, used)
+                    _store(twin, call, used, _LAPACK in text)
             if path and twin:
                 with contextlib.suppress(OSError):
                     os.link(twin, path)
@@ -134,14 +138,14 @@ def _make_room() -> None:
         return
 
 
-def _twin(path: Path, lowered: Any, arguments: tuple, devices: Sequence) -> Path:
+def _twin(path: Path, text: str, arguments: tuple, devices: Sequence) -> Path:
     """Returns where a program lies under its own text: other source may have given the same.
 
     The text says nothing of arguments that the function does not read, but a stored program knows
     its arguments by their places among all of them.
     """
-    text = hashlib.sha256((repr(arguments) + lowered.as_text()).encode())
-    return path.with_name(f"{_platform(devices)}-{text.hexdigest()}")
+    digest = hashlib.sha256((repr(arguments) + text).encode())
+    return path.with_name(f"{_platform(devices)}-{digest.hexdigest()}")
 
 
 @contextlib.contextmanager
@@ -222,13 +226,13 @@ def package_digest() -> str:
     return digest.hexdigest()
 
 
-def _store(path: Path, call: Any, used: tuple[bool, ...]) -> None:
+def _store(path: Path, call: Any, used: tuple[bool, ...], lapack: bool) -> None:
     """Writes a program; one that cannot be written is made again next time."""
     try:
         binary, _, out_tree = serialize(call)
         # A treedef of library types cannot be pickled, a tree of numbers can.
         outline = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
-        content = pickle.dumps((binary, outline, used))
+        content = pickle.dumps((binary, outline, used, lapack))
     except (ValueError, NotImplementedError, pickle.PickleError, RuntimeError):
         return
     with contextlib.suppress(OSError):
@@ -242,11 +246,24 @@ def _store(path: Path, call: Any, used: tuple[bool, ...]) -> None:
             old.unlink(missing_ok=True)
 
 
+@functools.cache
+def _bind_lapack() -> None:
+    """Makes JAX look up LAPACK's functions, which programs call by address.
+
+    It does so when a call of one is lowered for a CPU, and a stored program skips that: it would
+    jump to nowhere.
+    """
+    square = jax.ShapeDtypeStruct((1, 1), np.float32)
+    jax.jit(jnp.linalg.cholesky).trace(square).lower(lowering_platforms=("cpu",))
+
+
 def _load(path: Path, tree: Any, devices: Sequence) -> tuple[Any, tuple[bool, ...]] | None:
     """Reads a program, or returns None: absent, damaged, or not for this machine."""
     try:
-        binary, outline, used = pickle.loads(path.read_bytes())
+        binary, outline, used, lapack = pickle.loads(path.read_bytes())
         path.touch()
+        if lapack:
+            _bind_lapack()
         in_tree = jax.tree.structure((jax.tree.unflatten(tree, range(tree.num_leaves)), {}))
         out_tree = jax.tree.structure(outline)
         return deserialize_and_load(binary, in_tree, out_tree, execution_devices=devices), used

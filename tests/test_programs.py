@@ -1,5 +1,7 @@
 """Compiled programs in the process: found again, and dropped when there is no more room."""
 
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 
+import lapack_child
 from spdm_jax import programs
 
 
@@ -64,3 +67,15 @@ def test_systems_that_do_not_tell_keep_all(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(programs, "_MAPS", Path("/nowhere/maps"))
     monkeypatch.setattr(programs, "_MAX_MAPS", Path("/nowhere/max"))
     assert made(2) and made(3) and not made(2)
+
+
+def test_stored_programs_find_lapack(tmp_path: Path):
+    child = Path(lapack_child.__file__)
+    told = []
+    for _ in range(2):
+        run = subprocess.run(
+            [sys.executable, str(child), str(tmp_path)], capture_output=True, text=True
+        )
+        assert run.returncode == 0, run
+        told.append(run.stdout.strip())
+    assert told == [f"{stored} [[2.0, 0.0], [0.0, 3.0]]" for stored in (False, True)]
