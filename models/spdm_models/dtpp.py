@@ -153,10 +153,10 @@ class Decoder(nnx.Module):
           branches: not used.
           dropout: of the attention blocks.
         """
-        *lead, num, seconds, width = query.shape
-        scene = encoding.tokens[..., None, :, :]
-        flat = query.reshape(*lead, num * seconds, width)
-        valid = encoding.valid[..., None, None, :]
+        *lead, agents, num, seconds, width = query.shape
+        # One row of queries: the keys are the same for all.
+        flat = query.reshape(*lead, agents * num * seconds, width)
+        scene, valid = encoding.tokens, encoding.valid[..., None, :]
         environment = self.environment_decoder(flat, scene, scene, dropout, valid)
         own = ego_tokens[..., None, :, :, :]
         past = jnp.tri(seconds, dtype=bool)

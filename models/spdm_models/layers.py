@@ -20,8 +20,10 @@ from jax.core import Tracer
 LAYER_NORM_EPSILON = 1e-5
 DROPOUT_RATE = 0.1
 
-# The exact form: torch's default, not Flax's.
-gelu = partial(jax.nn.gelu, approximate=False)
+
+def gelu(x: jax.Array) -> jax.Array:
+    """Returns x Phi(x), exactly: torch's default, not Flax's, and by erf as torch does."""
+    return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
 
 
 class Buffer(nnx.Variable):
