@@ -154,18 +154,25 @@ def write_figure(page: Path, cells: Sequence[Cell], runs: Sequence[Run]) -> list
 
     commits = ", ".join(dict.fromkeys(str(run.about.get("commit") or "unknown") for run in runs))
     counts = ", ".join(
-        f"{run.folder.name} ({run.about['num_scenarios'] - run.missing} scenarios)" for run in runs
+        dict.fromkeys(
+            f"{run.folder.name} ({run.about['num_scenarios'] - run.missing} scenarios)"
+            for run in runs
+        )
     )
     with matplotlib.rc_context(STYLE):
         figure = plot_pairs(cells)
-        small_print(figure, [f"{counts}, commit {commits}"])
+        small_print(figure, [counts, f"commit {commits}"])
         settle(figure)
         return [save(figure, page.with_name(f"{page.stem}_subscores.{form}")) for form in FORMATS]
 
 
 def plot_pairs(cells: Sequence[Cell]) -> Figure:
-    """Draws each closed-loop metric of each learned planner: learned over perfect predictions."""
+    """Draws each closed-loop metric of each learned planner: learned over perfect predictions.
+
+    A column that has no such pair is left out.
+    """
     columns = [c for c in COLUMNS if c.traffic == "reactive"]
+    columns = [c for c in columns if pairs_of(cells, c)] or columns
     figure = new_figure(7.2, 3.9)
     axes = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     planners = [planner for planner in PLANNERS if planner != "pdm-closed"]
