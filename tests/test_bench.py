@@ -183,6 +183,7 @@ def test_page_shows_frames_of_navsim(tmp_path: Path):
     assert line_with(text, "| 64 x 64 |").endswith("| 40.00 | 5,120 |  |")
 
 
+@pytest.mark.slow
 def test_recorded_frames_are_scored_by_what_they_serve(tmp_path: Path):
     scene = road_scene()
     for devkit, samples in (("v1", 51), ("v2", 41)):
