@@ -67,7 +67,7 @@ def navsim_batch(child: Child, scenes: ScenarioSet, fan: np.ndarray, **counts: i
       counts: of the scenes, for the row.
     """
     frames = to_navsim(scenes, precision=child.precision)
-    poses = fan[:, STEPS_PER_POSE::STEPS_PER_POSE]
+    poses = _poses(fan)
     run = lambda some: score_frames(some, poses, NAVSIM2, precision=child.precision)
 
     def alone(found: NavsimScoreSet) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def navsim_batch(child: Child, scenes: ScenarioSet, fan: np.ndarray, **counts: i
 def _one_frame(
     child: Child, frames: NavsimSet, fan: np.ndarray, profile: Profile, name: str, **about: Any
 ) -> None:
-    poses = fan[:, STEPS_PER_POSE::STEPS_PER_POSE]
+    poses = _poses(fan)
     plans = np.ascontiguousarray(poses[None])
 
     def run(some: slice) -> NavsimScoreSet:
@@ -108,6 +108,11 @@ def _one_frame(
         return _summary(found)
 
     child.add(name, lambda: run(slice(None)), alone, frames=1, num_proposals=len(poses), **about)
+
+
+def _poses(fan: np.ndarray) -> np.ndarray:
+    """Returns the eight poses `[P, 8, 3]` that NAVSIM sees of trajectories `[P, 41, 3]`."""
+    return fan[:, STEPS_PER_POSE::STEPS_PER_POSE]
 
 
 def _summary(found: NavsimScoreSet) -> dict[str, Any]:

@@ -5,7 +5,6 @@ The checks solve problems whose answers are known beforehand. They take seconds,
 where the program that scores the scene has to be compiled first.
 """
 
-import importlib.metadata
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from spdm_experiments.runtime import version_of
 from spdm_jax import from_raw, score
 from spdm_jax.config import DT, NUM_STATES
 from spdm_jax.synthetic import make_scene
@@ -87,10 +87,7 @@ def report(cache: Path | None) -> tuple[list[str], bool]:
 
 def version(name: str) -> str:
     """Returns the installed version of a distribution, or that it is missing."""
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return 'not installed (pip install "spdm-jax[data,plot]")'
+    return version_of(name, 'not installed (pip install "spdm-jax[data,plot]")')
 
 
 def run_checks() -> list[Check]:

@@ -135,12 +135,12 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def version_of(package: str) -> str:
-    """Returns the installed version of a package; a checkout on the path has none."""
+def version_of(package: str, absent: str = "not installed") -> str:
+    """Returns the installed version of a package, or `absent`: a checkout on the path has none."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+        return absent
 
 
 def provenance() -> dict[str, object]:
