@@ -103,6 +103,21 @@ def visit_true(
     return jax.lax.while_loop(more, some, (jnp.int32(0), start))[1]
 
 
+def when(wanted: jax.Array, change: Callable[[Carry], Carry], value: Carry) -> Carry:
+    """Returns `change(value)` where wanted and `value` elsewhere, like `lax.cond`.
+
+    Under vmap `lax.cond` becomes a selection and copies whatever its branches read, the map
+    included, once for every row. This is a loop of at most one turn: what it reads is shared.
+
+    Args:
+      wanted: `[]` bool.
+      change: what may be left out.
+      value: any pytree.
+    """
+    turn = lambda state: (jnp.zeros_like(wanted), change(state[1]))
+    return jax.lax.while_loop(lambda state: state[0], turn, (wanted, value))[1]
+
+
 def rank_of(*keys: jax.Array) -> jax.Array:
     """Place of each entry in lexicographic order, `[N]` int32; the last key is the primary one.
 

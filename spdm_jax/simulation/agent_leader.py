@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from spdm_jax.arrays import when
 from spdm_jax.geometry import Box, crosses_upward_ray
 from spdm_jax.simulation.agent_paths import path_from, path_pose, start_of_rest
 from spdm_jax.simulation.agent_state import Agent, RoadFacts
@@ -171,10 +172,14 @@ def find_lead(
         met |= within(outlook.x[0], outlook.y[0])
         limit = jnp.maximum(best, tiny)
 
-        def measure():
-            return jnp.where(within(body_x, body_y), 0, shapes_distance(own, shape, limit))
+        wants = met & (j != i)
 
-        distance = jax.lax.cond(met & (j != i), measure, lambda: limit)
+        def measure(limit):
+            # A row that does not ask, under vmap, ends its search at once.
+            nearer = shapes_distance(own, shape, jnp.where(wants, limit, 0))
+            return jnp.where(within(body_x, body_y), 0, nearer)
+
+        distance = when(wants, measure, limit)
         takes = (distance < limit) & ((distance < best) | (j < lead))
         return (
             bound.at[j].set(jnp.inf),

@@ -5,15 +5,18 @@ follows the nearest of it with the intelligent driver model. They move one after
 ones see where earlier ones have gone.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from spdm_jax.arrays import when
 from spdm_jax.geometry import Box, wrap
 from spdm_jax.simulation.agent_leader import (
     Lead,
     Obstacles,
+    Outlook,
     find_lead,
     gather_obstacles,
     look_ahead,
@@ -78,17 +81,15 @@ def _extend(
 
 
 class _Motion(NamedTuple):
-    """What changes while the agents move in turn, `[K]` each."""
+    """What changes while the agents move in turn.
 
-    progress: jax.Array
-    speed: jax.Array
-    target_speed: jax.Array
-    x: jax.Array
-    y: jax.Array
-    heading: jax.Array
+    Attributes:
+      agents: `Agent` `[K]`.
+      obstacles: `gather_obstacles` of them and all else on the road.
+    """
+
+    agents: Agent
     obstacles: Obstacles
-    moved: jax.Array
-    skipped: jax.Array
 
 
 def idm_acceleration(
@@ -164,103 +165,57 @@ def step_traffic(
         egos = jax.tree.map(lambda a, b: jnp.stack([a, b]), ego_box, reach)
         heeds = heeds_reach(script, agents, scene_map, ego_box, reach, iteration)
     num_egos = egos.x.shape[0]
-    # Routes and corridors depend on nobody else: all at once.
-    agents = jax.vmap(lambda agent, drives: _extend(agent, drives, lanes, facts, lights, params))(
-        agents, drives
-    )
-    num_stops = facts.stop_edges.shape[0]
-    outlooks = jax.vmap(lambda agent: look_ahead(agent, lanes, lights, num_stops))(agents)
-    ends = jax.vmap(path_end)(agents.path)
-    limit = lanes.speed_limit[agents.route[:, -1]]
-    target = jnp.where(limit > 0, limit, agents.target_speed)
 
-    def advance(i, lead: Lead, now: _Motion):
+    def advance(agent: Agent, lead: Lead, outlook: Outlook, ego_speed, now: _Motion):
         k = jnp.clip(lead.obstacle, 0, num - 1)
         is_agent = (lead.obstacle >= 0) & (lead.obstacle < num)
         is_ego = (lead.obstacle >= num) & (lead.obstacle < num + num_egos)
-        lead_speed = jnp.where(is_agent, now.speed[k], jnp.where(is_ego, ego_speeds[i], 0))
-        direction = jnp.where(is_agent, now.heading[k], ego_heading)
-        lead_speed = lead_speed * jnp.cos(wrap(direction - outlooks.heading[i]))
+        lead_speed = jnp.where(is_agent, now.agents.speed[k], jnp.where(is_ego, ego_speed, 0))
+        direction = jnp.where(is_agent, now.agents.heading[k], ego_heading)
+        lead_speed = lead_speed * jnp.cos(wrap(direction - outlook.heading))
         # Where nothing is ahead, the end of the path is a wall.
-        wall = ends[i] - now.progress[i] - 0.5 * agents.length[i]
+        wall = path_end(agent.path) - agent.progress - 0.5 * agent.length
         space = jnp.where(lead.obstacle < 0, wall, lead.gap)
-        accel = idm_acceleration(now.speed[i], target[i], space, lead_speed, params)
-        progress = now.progress[i] + now.speed[i] * dt
-        speed = jnp.maximum(now.speed[i] + accel * dt, 0)
-        path = jax.tree.map(lambda v: v[i], agents.path)
-        size = agents.length[i], agents.width[i]
-        return (
-            progress,
-            speed,
-            footprint(path, progress, speed, *size, params, sizes.footprint_points),
+        limit = lanes.speed_limit[agent.route[-1]]
+        target = jnp.where(limit > 0, limit, agent.target_speed)
+        accel = idm_acceleration(agent.speed, target, space, lead_speed, params)
+        progress = agent.progress + agent.speed * dt
+        speed = jnp.maximum(agent.speed + accel * dt, 0)
+        size = agent.length, agent.width
+        place = footprint(agent.path, progress, speed, *size, params, sizes.footprint_points)
+        return agent.replace(
+            progress=progress,
+            speed=speed,
+            target_speed=target,
+            moved=jnp.bool_(True),
+            **place._asdict(),
         )
+
+    def move(i, agent: Agent, now: _Motion) -> Agent:
+        agent = _extend(agent, drives[i], lanes, facts, lights, params)
+        outlook = look_ahead(agent, lanes, lights, facts.stop_edges.shape[0])
+        # Under vmap this is computed for agents that stand as well: they need not search.
+        exists = now.obstacles.exists & drives[i]
+        if heeds is not None:
+            exists = exists.at[num + 1].set(heeds[i] & drives[i])
+        visible = now.obstacles._replace(exists=exists)
+        lead = find_lead(i, 0.5 * agent.width, agent.moved, outlook, visible, facts)
+        goes = advance(agent, lead, outlook, ego_speeds[i], now)
+        stays = agent.replace(skipped=jnp.bool_(True))
+        return jax.tree.map(partial(jnp.where, lead.sees_itself), goes, stays)
 
     def update(i, now: _Motion):
-        outlook = jax.tree.map(lambda v: v[i], outlooks)
-        obstacles = now.obstacles
-        stays = (
-            now.progress[i],
-            now.speed[i],
-            (
-                now.x[i],
-                now.y[i],
-                now.heading[i],
-                jax.tree.map(lambda v: v[i], obstacles.shape),
-                obstacles.circle[i],
-            ),
-        )
-
-        def move():
-            half_width = 0.5 * agents.width[i]
-            visible = obstacles
-            if heeds is not None:
-                exists = obstacles.exists.at[num + 1].set(heeds[i])
-                visible = obstacles._replace(exists=exists)
-            lead = find_lead(i, half_width, now.moved[i], outlook, visible, facts)
-            progress, speed, place = advance(i, lead, now)
-            goes = (progress, speed, tuple(place))
-            return jax.tree.map(
-                lambda a, b: jnp.where(lead.sees_itself, a, b), goes, stays
-            ), lead.sees_itself
-
-        (progress, speed, place), went = jax.lax.cond(
-            drives[i], move, lambda: (stays, jnp.bool_(False))
-        )
-        x, y, heading, shape, circle = place
+        agent = jax.tree.map(lambda v: v[i], now.agents)
+        agent = when(drives[i], lambda agent: move(i, agent, now), agent)
         put = lambda values, new: values.at[i].set(new)
+        shape = jax.tree.map(put, now.obstacles.shape, agent.shape)
+        circle = put(now.obstacles.circle, agent.circle)
         return _Motion(
-            progress=put(now.progress, progress),
-            speed=put(now.speed, speed),
-            target_speed=put(now.target_speed, jnp.where(went, target[i], now.target_speed[i])),
-            x=put(now.x, x),
-            y=put(now.y, y),
-            heading=put(now.heading, heading),
-            obstacles=obstacles._replace(
-                shape=jax.tree.map(put, obstacles.shape, shape),
-                circle=put(obstacles.circle, circle),
-            ),
-            moved=put(now.moved, now.moved[i] | went),
-            skipped=put(now.skipped, now.skipped[i] | (drives[i] & ~went)),
+            agents=jax.tree.map(put, now.agents, agent),
+            obstacles=now.obstacles._replace(shape=shape, circle=circle),
         )
 
-    start = _Motion(
-        progress=agents.progress,
-        speed=agents.speed,
-        target_speed=agents.target_speed,
-        x=agents.x,
-        y=agents.y,
-        heading=agents.heading,
-        obstacles=gather_obstacles(agents, egos, replayed, present, facts),
-        moved=agents.moved,
-        skipped=agents.skipped,
-    )
-    end = jax.lax.fori_loop(0, traffic.count, update, start)
-    moved = end._asdict()
-    obstacles = moved.pop("obstacles")
-    agents = agents.replace(
-        **moved,
-        shape=jax.tree.map(lambda v: v[:num], obstacles.shape),
-        circle=obstacles.circle[:num],
-    )
+    start = _Motion(agents, gather_obstacles(agents, egos, replayed, present, facts))
+    agents = jax.lax.fori_loop(0, traffic.count, update, start).agents
     overflow |= traffic.overflow | jnp.any(agents.overflow & agents.active)
     return traffic.replace(agents=agents, overflow=overflow)

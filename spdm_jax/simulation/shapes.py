@@ -106,12 +106,16 @@ def run_circles(x: jax.Array, y: jax.Array, half_width: jax.Array, run: int = RU
 
     Runs without extent get a negative radius.
     """
-    index = np.arange(x.shape[0] // run)[:, None] * run + np.arange(run + 1)
-    px, py = x[index], y[index]
-    low_x, high_x, low_y, high_y = px.min(1), px.max(1), py.min(1), py.max(1)
+    # Slices, not one gather of all runs: those of many agents are most of a step of traffic.
+    first = lambda v: v[:-1].reshape(-1, run)
+    last = lambda v: v[run::run]
+    low = lambda v: jnp.minimum(jnp.min(first(v), axis=1), last(v))
+    high = lambda v: jnp.maximum(jnp.max(first(v), axis=1), last(v))
+    low_x, high_x, low_y, high_y = low(x), high(x), low(y), high(y)
     cx, cy = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
-    square = (px - cx[:, None]) ** 2 + (py - cy[:, None]) ** 2
-    reach = jnp.sqrt(jnp.max(square, axis=1)) + half_width
+    inner = (first(x) - cx[:, None]) ** 2 + (first(y) - cy[:, None]) ** 2
+    square = jnp.maximum(jnp.max(inner, axis=1), (last(x) - cx) ** 2 + (last(y) - cy) ** 2)
+    reach = jnp.sqrt(square) + half_width
     empty = (low_x == high_x) & (low_y == high_y)
     return cx, cy, jnp.where(empty, -1, reach)
 
