@@ -167,7 +167,8 @@ def refined_task(config: GameFormerConfig, refiner: DIPPRefinerConfig | None = N
     Neither the paper nor public code fixes this training. Chosen: GameFormer's recipe and loss; as
     in DIPP, from a quarter of the training on the refined plan's loss and its costs are added. The
     solve starts at the network's plan and sees the best-scored future of each neighbour, as at
-    test. The costs' weights are a softmax of logits that start equal.
+    test; the futures learn from their own loss alone. The costs' weights are a softmax of logits
+    that start equal.
     """
     refiner = refiner or DIPPRefinerConfig()
     solved = replace(refiner, solver=TRAIN_SOLVER)
@@ -186,7 +187,8 @@ def refined_task(config: GameFormerConfig, refiner: DIPPRefinerConfig | None = N
         )
         return jax.vmap(one)(
             output.plan,
-            _best_scored(output),
+            # Through the solve they would learn to be far from the ego, not to be right.
+            jax.lax.stop_gradient(_best_scored(output)),
             batch.features.ego_past,
             batch.features.neighbors_past,
             batch.path,

@@ -18,6 +18,9 @@ SMOKE = FitConfig(steps=40, batch=BATCH, rate=3e-3, every=40)
 LONG = dataclasses.replace(SMOKE, rate=1e-3, steps=3000, every=3000, dropout=False)
 # By heart: mean and last error of plan and predictions, m.
 NEAR = {"minADE": 0.3, "minFDE": 0.6, "planADE": 0.3, "planFDE": 0.6}
+# DIPP's costs want the speed limit, which these roads' ego does not drive at: the plan is learnt as
+# the start from which two steps of the solve come close.
+REFINED = {**NEAR, "planADE": 0.6, "refinedADE": 1.0, "refinedFDE": 2.0}
 
 
 def learn(name, config, folder):
@@ -47,7 +50,8 @@ def test_eight_scenes_are_learnt_by_heart(name, tmp_path):
     assert losses[-10:].mean() < 0.1 * abs(losses[:10].mean())
     found = validate(jax.jit(task.metrics), fitted.params, samples, BATCH)
     print(name, found, fitted.log.losses[-1])
-    for metric, limit in NEAR.items():
+    limits = REFINED if name == "gameformer-dipp" else NEAR
+    for metric, limit in limits.items():
         assert found[metric] < limit, (metric, found)
 
 
