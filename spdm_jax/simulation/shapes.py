@@ -20,6 +20,9 @@ WIDTH = 3 * RUN
 """Boxes in one block: a rectangle and two chords of the wedge per segment."""
 _WINDOW = 16
 """Runs of a strip that are searched together."""
+_FAR = 1e9
+_SLACK = 2e-3
+"""Bounds are this much too wide, m: rounding must not part what touches."""
 # Round joins have 16 segments per quarter circle; a bend gets round(angle / 5.625 deg) of them.
 _TWO_CHORDS = float(np.cos(1.5 * np.pi / 2 / 16))
 
@@ -172,6 +175,46 @@ def shape_circle(shape: Blocks) -> jax.Array:
     return jnp.stack([x, y, jnp.max(jnp.where(some, reach, -1))])
 
 
+def _around_runs(x: jax.Array, y: jax.Array, half_width: jax.Array) -> Box:
+    """Boxes `[B]` that hold the runs of a strip with vertices `[RUN B + 1]`."""
+    vertices = lambda v: jnp.concatenate([v[:-1].reshape(-1, RUN), v[RUN::RUN, None]], axis=1)
+    px, py = vertices(x), vertices(y)
+    axis = _segment_box(px[:, 0], py[:, 0], px[:, -1], py[:, -1])
+    return _aligned(axis, px, py, half_width, half_width)
+
+
+def _around_blocks(shape: Blocks) -> Box:
+    """Boxes `[B]` that hold the blocks of a shape; those of empty ones mean nothing."""
+    box = shape.box
+    axis = jax.tree.map(lambda v: v[:, 0], box)
+    cos, sin = axis.cos[:, None], axis.sin[:, None]
+    along = jnp.abs(box.cos * cos + box.sin * sin)
+    across = jnp.abs(box.sin * cos - box.cos * sin)
+    length = box.half_length * along + box.half_width * across
+    width = box.half_length * across + box.half_width * along
+    return _aligned(axis, box.x, box.y, length, width, shape.used)
+
+
+def _aligned(axis: Box, x, y, half_length, half_width, used=True) -> Box:
+    """Boxes `[B]` in the direction of `axis` around used points `[B, N]` with their extents."""
+    cos, sin = axis.cos[:, None], axis.sin[:, None]
+    dx, dy = x - axis.x[:, None], y - axis.y[:, None]
+
+    def span(at, half):
+        low = jnp.min(jnp.where(used, at - half, _FAR), axis=1)
+        high = jnp.max(jnp.where(used, at + half, -_FAR), axis=1)
+        return 0.5 * (low + high), 0.5 * (high - low)
+
+    along, length = span(dx * cos + dy * sin, half_length)
+    aside, width = span(dy * cos - dx * sin, half_width)
+    return axis._replace(
+        x=axis.x + along * axis.cos - aside * axis.sin,
+        y=axis.y + along * axis.sin + aside * axis.cos,
+        half_length=length + _SLACK,
+        half_width=width + _SLACK,
+    )
+
+
 def circle_gap(ax, ay, ar, bx, by, br) -> jax.Array:
     """Lower bound of the distance between what circles `[A]` and `[B]` hold, `[A, B]`.
 
@@ -253,9 +296,14 @@ def strip_meets(
         begin = jnp.minimum(start, num - size)
         sx, sy, sr = (jax.lax.dynamic_slice_in_dim(v, begin, size) for v in circles)
         low = circle_gap(sx, sy, sr, shape.x, shape.y, shape.radius)
-        # Bounds have some slack, so only pairs whose circles touch are below 0.
-        low = jnp.where(low < 0, low, jnp.inf)
+        # Circles of a car on the lane beside touch, boxes along both lanes do not. All bounds have
+        # some slack, so that every pair that meets is left.
+        vertices = lambda v: jax.lax.dynamic_slice_in_dim(v, begin * RUN, size * RUN + 1)
+        runs = _around_runs(vertices(x), vertices(y), half_width)
+        touch = boxes_overlap(jax.tree.map(lambda v: v[:, None], runs), blocks)
+        low = jnp.where((low < 0) & touch, low, jnp.inf)
         return start + size, _search(low, apart, lambda i, j: measure(begin + i, j))
 
+    blocks = _around_blocks(shape)
     first = jnp.where(jnp.any(near), jnp.argmax(near), num)
     return jax.lax.while_loop(more, window, (first, jnp.ones_like(half_width)))[1] <= 0
