@@ -195,7 +195,7 @@ def _around_blocks(shape: Blocks) -> Box:
     return _aligned(axis, box.x, box.y, length, width, shape.used)
 
 
-def _aligned(axis: Box, x, y, half_length, half_width, used=True) -> Box:
+def _aligned(axis: Box, x, y, half_length, half_width, used: jax.Array | bool = True) -> Box:
     """Boxes `[B]` in the direction of `axis` around used points `[B, N]` with their extents."""
     cos, sin = axis.cos[:, None], axis.sin[:, None]
     dx, dy = x - axis.x[:, None], y - axis.y[:, None]

@@ -74,6 +74,35 @@ def test_vehicles_are_as_far_apart_as_buffered_lines(dtype, tolerance: float):
     assert 5 < met < 75
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_what_touches_by_a_centimetre_meets(dtype):
+    """A small box, and a small strip, along one side of every strip: bounds must not lose it."""
+    rng = np.random.default_rng(7)
+    half, overlap = 0.3, 0.01
+
+    @jax.jit
+    def both(a, half_a, probe, body, away):
+        xy = lambda points: (points[:, 0], points[:, 1])
+        box = one_box(Box(*body))
+        circles = run_circles(*xy(a), half_a)
+        by_box = strip_meets(*xy(a), half_a, circles, box, shape_circle(box))
+        shape = vehicle_shape(*xy(a), half_a, Box(*away))
+        circles = run_circles(*xy(probe), body[5])
+        return by_box, strip_meets(*xy(probe), body[5], circles, shape, shape_circle(shape))
+
+    for _ in range(60):
+        a, half_a, side = line(rng), rng.uniform(0.8, 1.3), rng.choice([-1, 1])
+        k = rng.integers(len(a) - 1)
+        way = (a[k + 1] - a[k]) / np.linalg.norm(a[k + 1] - a[k])
+        aside = side * np.array([-way[1], way[0]])
+        middle = 0.5 * (a[k] + a[k + 1]) + (half_a + half - overlap) * aside
+        probe = filled(np.stack([middle - 0.1 * way, middle + 0.1 * way]))
+        body = np.array([*middle, *way, 0.1, half])
+        away = np.array([*(middle + 90 * aside), *way, 0.1, half])
+        given = (filled(a), half_a, probe, body, away)
+        assert all(both(*(jnp.asarray(v, dtype) for v in given)))
+
+
 def test_a_strip_without_extent_meets_nothing():
     point = jnp.zeros(SIZE)
     circles = run_circles(point, point, jnp.asarray(1.0))
