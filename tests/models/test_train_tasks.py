@@ -51,6 +51,10 @@ def test_eight_scenes_are_learnt_by_heart(name, tmp_path):
     found = validate(jax.jit(task.metrics), fitted.params, samples, BATCH)
     print(name, found, fitted.log.losses[-1])
     limits = REFINED if name == "gameformer-dipp" else NEAR
+    if name == "dtpp":
+        # It chooses: the branch that ends nearest is known by heart, its way there is the tree's.
+        missed = np.linalg.norm(samples.second[:, 0, :, :2] - samples.ego[..., :2], axis=-1)
+        limits = {**NEAR, "planADE": missed.mean() + 1e-3, "planFDE": missed[:, -1].mean() + 1e-3}
     for metric, limit in limits.items():
         assert found[metric] < limit, (metric, found)
 
