@@ -4,7 +4,6 @@ Scenarios come from `spdm_jax.load(...).batch` by `to_device`; `vmap` (or `lax.m
 leading axis. Settings are `PlannerParams` (traced) and `PlannerConfig` (static).
 """
 
-from spdm_jax.api import score_scene
 from spdm_jax.padding import to_device
 from spdm_jax.planner import (
     PlannerState,
@@ -15,6 +14,7 @@ from spdm_jax.planner import (
     plan,
     step,
 )
+from spdm_jax.scene_score import score_scene
 from spdm_jax.scoring.score import World, score_trajectories
 from spdm_jax.soft import soft_score_scene
 from spdm_jax.tracking.lqr import track

@@ -11,11 +11,12 @@ import numpy as np
 from jax.core import Tracer
 
 from spdm_jax.agents.forecast import ForecastPoses
-from spdm_jax.api import fit_config, surroundings
+from spdm_jax.api import fit_config
 from spdm_jax.config import DT, PlannerConfig, PlannerParams, Tracker
 from spdm_jax.decision import cast_params, poses_only
 from spdm_jax.padding import to_device
 from spdm_jax.results import ScenarioSet
+from spdm_jax.scene_score import surroundings
 from spdm_jax.scoring.soft import SoftScores, SoftWorld, soft_score_trajectories
 from spdm_jax.torch_bridge.task import Task, differentiated, place
 from spdm_jax.tracking.lqr import track

@@ -12,11 +12,11 @@ import pytest
 import small_road as roads
 import spdm_jax
 from spdm_jax import functional
-from spdm_jax.api import score_scene
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.io.raw import RawScenario
 from spdm_jax.padding import PaddingConfig
 from spdm_jax.planner import PlanResult
+from spdm_jax.scene_score import score_scene
 from spdm_jax.synthetic import make_scene
 from spdm_jax.types import EgoState, ObjectType, SubScores
 

@@ -25,7 +25,7 @@ import sweep_pack
 from spdm_experiments import cli, label_work
 from spdm_experiments.label import parse_components, read_vocabulary
 from spdm_experiments.label_scene import COMPONENTS, Part, Scored
-from spdm_jax import api, labels, load, score
+from spdm_jax import api, labels, load, scene_score, score
 from spdm_jax.labels import Labels, open_labels
 
 COUNT = 6
@@ -466,7 +466,7 @@ def real(pack: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path
 
 
 def test_labels_are_the_scores(real: dict[str, Path], pack: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(api, "BLOCK_SIZES", (16,))
+    monkeypatch.setattr(scene_score, "BLOCK_SIZES", (16,))
     wanted = score(load(pack, limit=2), fan(24))
     found = open_labels(real["f32"])
     rows = found.batch(TOKENS[:2])

@@ -16,7 +16,7 @@ PACKAGES = {
     module.__name__: Path(str(module.__file__)).parent
     for module in (spdm_jax, spdm_models, spdm_experiments)
 }
-MAX_LINES = 600
+MAX_LINES = 550
 
 # Each part of the library with the parts that it may import besides itself. A part that is not
 # listed here fails the test below, so that a new one gets its place in the order.
@@ -44,6 +44,7 @@ ALLOWED = {
     "trajectories": {"types", "config"},
     "results": {"types", "config", "planner"},
     "nested": STAGES | {"decision", "planner"},
+    "scene_score": STAGES | {"decision", "planner", "batching", "results"},
     "vocabulary": {"types", "config", "trajectories"},
     "labels": set[str](),
     "viz": STAGES | {"io", "planner", "results"},

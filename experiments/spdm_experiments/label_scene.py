@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from spdm_jax.api import score_scene
 from spdm_jax.config import PlannerConfig, PlannerParams
 from spdm_jax.decision import poses_only
+from spdm_jax.scene_score import score_scene
 from spdm_jax.scoring.aggregate import aggregate_sets
 from spdm_jax.trajectories import STATE_COLUMNS, to_local, untracked_states
 from spdm_jax.types import Array, EgoState, Scenario, ScenarioBatch

@@ -13,10 +13,10 @@ from spdm_experiments.loading import LoadedScenes, Loader
 from spdm_experiments.record import REASONS
 from spdm_experiments.sweep_scene import UNREAD
 from spdm_jax import Failure, PlannerParams
-from spdm_jax.api import BLOCK_SIZES
 from spdm_jax.batching import BatchConfig, Precision, SceneRunner, padded_bytes, prefetch
 from spdm_jax.config import NUM_STATES
 from spdm_jax.padding import PaddingConfig, bucket
+from spdm_jax.scene_score import BLOCK_SIZES
 from spdm_jax.trajectories import STATE_COLUMNS
 from spdm_jax.types import ScenarioBatch
 

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from spdm_jax.api import score_scene
 from spdm_jax.config import DT, NUM_STATES, PlannerConfig, PlannerParams
 from spdm_jax.decision import poses_only
 from spdm_jax.navsim.evaluate import POSE_DT, STEPS_PER_POSE
@@ -20,6 +19,7 @@ from spdm_jax.navsim.results import COMPONENTS as NAVSIM_COMPONENTS
 from spdm_jax.navsim.results import component
 from spdm_jax.navsim.score import score_trajectories
 from spdm_jax.navsim.types import NUM_POSES, NavsimScene
+from spdm_jax.scene_score import score_scene
 from spdm_jax.scoring.profile import Profile
 from spdm_jax.trajectories import Frame, resampling
 from spdm_jax.types import Array, EgoState, Scenario
