@@ -14,7 +14,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +25,8 @@ import sweep_pack
 from spdm_experiments import cli, label_work
 from spdm_experiments.label import parse_components, read_vocabulary
 from spdm_experiments.label_scene import COMPONENTS, Part, Scored
-from spdm_jax import api, labels, load, scene_score, score
+from spdm_jax import labels, load, scene_score, score
+from spdm_jax.config import PlannerConfig
 from spdm_jax.labels import Labels, open_labels
 
 COUNT = 6
@@ -483,7 +484,7 @@ def test_labels_without_a_tracker_are_the_scores(pack: Path, tmp_path: Path):
     np.save(tmp_path / "v.npy", fan(12))
     more = ("--dtype", "f32", "--limit", "2", "--tracker", "none", "--progress-reference", "goal")
     assert run(pack, tmp_path / "v.npy", tmp_path / "labels", *more) == 0
-    config = cast(Any, api).PlannerConfig(progress_reference="goal")
+    config = PlannerConfig(progress_reference="goal")
     wanted = score(load(pack, limit=2), fan(12), tracker="none", config=config)
     rows = open_labels(tmp_path / "labels").batch(TOKENS[:2])
     for i, name in enumerate(COMPONENTS):
