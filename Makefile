@@ -18,10 +18,10 @@ demo: $(INSTALLED)
 	@.venv/bin/spdm demo --out demo $(DEMO_ARGS)
 
 test: $(INSTALLED)
-	@$(PY) -m pytest -m "not slow" -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	@$(PY) -m pytest -m "not slow" -n $(WORKERS) $(PYTEST_ARGS)
 
 test-all: $(INSTALLED)
-	@$(PY) -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	@$(PY) -m pytest -n $(WORKERS) $(PYTEST_ARGS)
 
 lint: $(INSTALLED)
 	@$(PY) -m ruff check .
