@@ -104,21 +104,21 @@ def strip_boxes(x: jax.Array, y: jax.Array, half_width: jax.Array) -> tuple[Box,
     return boxes, join(used, bends, bends & two)
 
 
+def _by_run(values: jax.Array, run: int = RUN) -> jax.Array:
+    """Vertices `[B, run + 1]` of all runs; slices, which cost less than one gather of all."""
+    return jnp.concatenate([values[:-1].reshape(-1, run), values[run::run, None]], axis=1)
+
+
 def run_circles(x: jax.Array, y: jax.Array, half_width: jax.Array, run: int = RUN) -> Circles:
     """Circles around runs of segments of a strip with vertices `[run B + 1]`.
 
     Runs without extent get a negative radius.
     """
-    # Slices, not one gather of all runs: those of many agents are most of a step of traffic.
-    first = lambda v: v[:-1].reshape(-1, run)
-    last = lambda v: v[run::run]
-    low = lambda v: jnp.minimum(jnp.min(first(v), axis=1), last(v))
-    high = lambda v: jnp.maximum(jnp.max(first(v), axis=1), last(v))
-    low_x, high_x, low_y, high_y = low(x), high(x), low(y), high(y)
+    px, py = _by_run(x, run), _by_run(y, run)
+    low_x, high_x, low_y, high_y = px.min(1), px.max(1), py.min(1), py.max(1)
     cx, cy = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
-    inner = (first(x) - cx[:, None]) ** 2 + (first(y) - cy[:, None]) ** 2
-    square = jnp.maximum(jnp.max(inner, axis=1), (last(x) - cx) ** 2 + (last(y) - cy) ** 2)
-    reach = jnp.sqrt(square) + half_width
+    square = (px - cx[:, None]) ** 2 + (py - cy[:, None]) ** 2
+    reach = jnp.sqrt(jnp.max(square, axis=1)) + half_width
     empty = (low_x == high_x) & (low_y == high_y)
     return cx, cy, jnp.where(empty, -1, reach)
 
@@ -152,7 +152,7 @@ def outline_shape(edges: jax.Array, valid: jax.Array, num_blocks: int) -> Blocks
     ax, ay, bx, by = edges.reshape(num_blocks, WIDTH, 4).transpose(2, 0, 1)
     used = valid.reshape(num_blocks, WIDTH)
     boxes = _segment_box(ax, ay, bx, by)
-    far = jnp.asarray(1e9, ax.dtype)
+    far = jnp.asarray(_FAR, ax.dtype)
     low = lambda a, b: jnp.min(jnp.where(used, jnp.minimum(a, b), far), axis=1)
     high = lambda a, b: jnp.max(jnp.where(used, jnp.maximum(a, b), -far), axis=1)
     x0, x1, y0, y1 = low(ax, bx), high(ax, bx), low(ay, by), high(ay, by)
@@ -165,7 +165,7 @@ def outline_shape(edges: jax.Array, valid: jax.Array, num_blocks: int) -> Blocks
 def shape_circle(shape: Blocks) -> jax.Array:
     """Circle around a whole shape: x, y, radius `[3]`; an empty shape has a negative radius."""
     some = shape.radius >= 0
-    far = jnp.asarray(1e9, shape.x.dtype)
+    far = jnp.asarray(_FAR, shape.x.dtype)
     low = lambda v: jnp.min(jnp.where(some, v - shape.radius, far))
     high = lambda v: jnp.max(jnp.where(some, v + shape.radius, -far))
     any_ = jnp.any(some)
@@ -177,8 +177,7 @@ def shape_circle(shape: Blocks) -> jax.Array:
 
 def _around_runs(x: jax.Array, y: jax.Array, half_width: jax.Array) -> Box:
     """Boxes `[B]` that hold the runs of a strip with vertices `[RUN B + 1]`."""
-    vertices = lambda v: jnp.concatenate([v[:-1].reshape(-1, RUN), v[RUN::RUN, None]], axis=1)
-    px, py = vertices(x), vertices(y)
+    px, py = _by_run(x), _by_run(y)
     axis = _segment_box(px[:, 0], py[:, 0], px[:, -1], py[:, -1])
     return _aligned(axis, px, py, half_width, half_width)
 
